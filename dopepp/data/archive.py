@@ -55,7 +55,7 @@ class BoundedStream(io.RawIOBase):
         return self._stream.seek(offset, whence)
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next ``size`` bytes.
+        """Return the next ``size`` bytes, or fewer at the end of the stream.
 
         Raises:
             ValueError: The size is negative (read everything) or above ``CHUNK_BYTES``.
@@ -114,7 +114,7 @@ def safe_extract(archive: Path | str, folder: Path | str) -> Path:
 
 
 def _check_members(archive: Path, tar: tarfile.TarFile) -> dict[PurePosixPath, tarfile.TarInfo]:
-    """Return the members by their paths in the folder, or reject the archive."""
+    """Return the members by their paths in the folder; raise a UserError for an unsafe member."""
     members: dict[PurePosixPath, tarfile.TarInfo] = {}
     is_folder: dict[str, bool] = {}
     for number, member in enumerate(tar):
@@ -152,7 +152,6 @@ def _problem(member: tarfile.TarInfo, path: PurePosixPath) -> str:
 
 
 def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
-    """Write a member to a new file, or make its folder."""
     if member.isdir():
         path.mkdir(parents=True, exist_ok=True)
         return
@@ -167,7 +166,6 @@ def _unpack(tar: tarfile.TarFile, member: tarfile.TarInfo, path: Path) -> None:
 
 
 def _rejection(archive: Path, reason: str) -> UserError:
-    """Return the error for an archive that is not unpacked."""
     allowed = "a complete tar file of plain files and folders that stay inside its own folder"
     fix = "do not trust the file; download it again from its source"
     return UserError(f"archive {archive}: {reason}", allowed, fix)

@@ -1,6 +1,6 @@
 """Collate samples into a batch of tensors, padded to the largest number of instances.
 
-Belief targets are computed from the keypoints on the training device.
+The training computes the target belief maps from the keypoints, on its device.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ class Batch:
     """Images of one size with their instances.
 
     Attributes:
+        images: RGB.
+        K: Camera matrices, pixels.
         T_cam_obj: Rigid transforms, metres; the identity in padding.
         keypoints: Projected cuboids in pixels; NaN behind the camera and in padding.
-        object_index: Index of the instance's object in the list of objects, −1 in padding.
+        object_index: Index of the instance's object among the network's objects, −1 in padding.
         visible_fraction: See ``Instance``; 0 in padding, like ``masked_fraction``.
     """
 
@@ -48,7 +50,7 @@ class Batch:
         return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
     def rows(self, index: Int[Tensor, " rows"]) -> Batch:
-        """Return the images with these indices, with their instances."""
+        """Return the batch of the images with these indices."""
         part = self._map(lambda tensor: tensor[index.to(tensor.device)])
         part.keys = [self.keys[number] for number in index.tolist()]
         part.sources = [self.sources[number] for number in index.tolist()]
@@ -59,7 +61,6 @@ class Batch:
         return self._map(lambda tensor: tensor.pin_memory())
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Batch:
-        """Apply a function to every tensor."""
         tensors: dict[str, Any] = {
             name: function(value) for name, value in vars(self).items() if isinstance(value, Tensor)
         }
@@ -67,7 +68,7 @@ class Batch:
 
 
 def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch:
-    """Stack samples of one size; ``object_index`` gives the index of each object by name."""
+    """Stack samples of one image size; ``object_index`` maps labels to indices of objects."""
     # At least one slot, because code that uses batches does not handle an empty axis.
     shape = (len(samples), max(1, *(len(sample.instances) for sample in samples)))
     fields = {

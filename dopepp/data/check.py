@@ -1,4 +1,4 @@
-"""Recognise a folder's layout and check it with its reader and its invariants.
+"""Recognise the layout of a data set's folder, and check its files and annotations for defects.
 
 To add a layout, write ``check_NAME(report)`` in the module of its invariants in
 :mod:`dopepp.data.formats`, and a line in ``LAYOUTS``.
@@ -19,7 +19,7 @@ from dopepp.data.formats.problems import CheckReport
 from dopepp.data.formats.webdataset.webdataset_invariants import check_webdataset, shard_paths
 from dopepp.data.formats.ycb_video.ycb_invariants import check_ycb
 
-_MAX_LISTED: Final = 8  # data sets of a parent folder in a message
+_MAX_LISTED: Final = 8  # data sets that an error message lists
 
 LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
     "YCB-Video": (lambda root: all((root / n).is_dir() for n in ("image_sets", "data")), check_ycb),
@@ -34,7 +34,7 @@ LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], N
 
 
 def check_dataset(root: Path) -> CheckReport:
-    """Check a data set.
+    """Return the defects of the data set in folder ``root``, in any layout of :data:`LAYOUTS`.
 
     Raises:
         UserError: The folder is missing, has an unknown layout, or holds several data sets.
@@ -59,12 +59,12 @@ def check_dataset(root: Path) -> CheckReport:
 
 
 def _layout_of(root: Path) -> str | None:
-    """Return the name of a folder's layout, or None if the folder has no known layout."""
+    """Return the first key of :data:`LAYOUTS` that fits a folder, or None."""
     return next((name for name, (is_layout, _) in LAYOUTS.items() if is_layout(root)), None)
 
 
 def _reject_parent(root: Path, layout: str | None) -> None:
-    """Reject a folder that holds data sets and is not a data set itself."""
+    """Raise a UserError if the subfolders of ``root``, of this layout, are separate data sets."""
     if (root / RECORD_FILE).is_file() or any(root.glob("*.json")):
         return
     folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]

@@ -44,7 +44,7 @@ from dopepp.parts.part import Part
 from dopepp.parts.size import LearnedRange, enclosing_range
 from dopepp.virtual.backgrounds import Backgrounds
 
-_MAX_MEASURED: Final = 200  # images of a source for measuring the parts' sizes
+_MAX_MEASURED: Final = 200  # images of a source in which the parts' sizes are measured
 
 
 class PoseDataModule(LightningDataModule):
@@ -55,7 +55,8 @@ class PoseDataModule(LightningDataModule):
 
     Args:
         input_size: (width, height) of the network's input, pixels.
-        backgrounds: Images for masks on objects that fill their image; required with ``masking``.
+        backgrounds: Images for the masking of objects that fill their image; required with
+            ``masking``.
         val_images: Whole images of the camera, if ``val`` shows windows of them (default:
             ``val``).
 
@@ -95,7 +96,7 @@ class PoseDataModule(LightningDataModule):
         self._backgrounds = backgrounds
 
     def train_item(self, epoch: int, index: int) -> Sample:
-        """Return a training item, a pure function of (seed, epoch, index)."""
+        """Return a training item, which depends only on (seed, epoch, index)."""
         # Padding comes last: as in prediction, it has no noise and is not used as background.
         sample = resize_sample(self.train_source.sample(index, epoch), self.input_size)
         rng = item_rng(self.seed, Purpose.AUGMENT, epoch, index)
@@ -108,15 +109,15 @@ class PoseDataModule(LightningDataModule):
         return pad_sample(sample, self.input_size)
 
     def val_item(self, epoch: int, index: int) -> Sample:
-        """Return a validation item, letterboxed."""
+        """Return a validation item, letterboxed to ``input_size``."""
         return letterbox_sample(self.val_source.sample(index, epoch), self.input_size)
 
     def train_dataloader(self) -> PoseLoader:
-        """Return the shuffled loader; the last incomplete batch is dropped."""
+        """Return the loader of batches in random order; the last incomplete batch is dropped."""
         return self._loader(SampleDataset(self.train_item, len(self.train_source)), shuffle=True)
 
     def val_dataloader(self) -> PoseLoader:
-        """Return the loader in order; all ranks together yield each item exactly once."""
+        """Return the loader of batches in order; all ranks together yield each item once."""
         return self._loader(SampleDataset(self.val_item, len(self.val_source)), shuffle=False)
 
     def _loader(self, dataset: SampleDataset, shuffle: bool) -> PoseLoader:
@@ -147,9 +148,9 @@ class PoseDataModule(LightningDataModule):
             raise UserError(problem, "objects with at least one instance in a training source", fix)
 
     def size_ranges(self, parts: Sequence[Part]) -> dict[str, LearnedRange]:
-        """Measure the ranges of size and distance of each part.
+        """Measure each part's range of size (pixels of the input) and depth (metres), by name.
 
-        Validation images are measured first; training images only for parts that they lack.
+        The first 200 validation images are measured, then training images for parts that they lack.
         """
         views: dict[str, list[LearnedRange]] = {part.name: [] for part in parts}
         for source in (self.val_source, self.train_source):
@@ -165,12 +166,12 @@ class PoseDataModule(LightningDataModule):
         return {name: enclosing_range(sizes) for name, sizes in views.items() if sizes}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
-        """Return the splits and descriptions of all sources, for the log at the start."""
+        """Return (split, description) of each source, for the log at the start of training."""
         splits = {"train": self.train_source, "val": self.val_source, "test": self.test_source}
         return [(split, info) for split, source in splits.items() for info in source.describe()]
 
     def fingerprint(self) -> str:
-        """Return a SHA-256 over everything that determines the images."""
+        """Return the SHA-256 (hex) of the seed and all sources' names, lengths and identities."""
         record: dict[str, list[object]] = {"train": [], "val": [], "test": []}
         for split, info in self.summary():
             record[split].append([info.name, info.num_images, dict(info.identity)])
@@ -203,7 +204,7 @@ class SampleDataset(Dataset[Sample | UserError]):
 
 
 class EpochSampler(DistributedSampler[tuple[int, int]]):
-    """Yields (epoch, index) in an order that depends on (seed, epoch) only.
+    """Sampler of (epoch, index) pairs in an order that depends only on (seed, epoch).
 
     Lightning keeps a ``DistributedSampler`` and calls its ``set_epoch``. To resume inside an epoch,
     the next pass skips this rank's first ``skip`` items.
@@ -297,7 +298,7 @@ class PoseLoader(DataLoader[Any]):
         return {"num_batches": self._num_batches}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Start the next pass after the batches yielded so far."""
+        """Start the next pass after the number of batches in ``state``."""
         self._resume_at = state["num_batches"] % max(1, len(self))
 
 

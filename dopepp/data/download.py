@@ -39,8 +39,9 @@ class DownloadSource:
     """An archive on the network.
 
     Attributes:
-        photos: Folder of the archive for ``virtual.backgrounds``.
-        licence: Terms that the user must know.
+        num_bytes: Exact size of the archive.
+        photos: Folder in the archive with photos for ``virtual.backgrounds``.
+        licence: Terms of use, logged before the download.
     """
 
     url: str
@@ -65,7 +66,7 @@ SOURCES: Final = {
 
 
 def download(name: str, folder: Path | str, progress: Progress | None = None) -> Path:
-    """Download and unpack a data set into ``folder/NAME`` unless present; return its photos.
+    """Download and unpack a data set into ``folder/NAME`` unless present; return its photo folder.
 
     Raises:
         UserError: The name is unknown, the network or the disk fails, or the file differs from the
@@ -95,10 +96,10 @@ def fetch(
 
     Args:
         url: An http or https address; redirections to other schemes or from https to http fail.
-        path: Target; a complete file is kept.
+        path: Path of the file; an existing file is only checked.
         num_bytes: Exact size of the file, which limits the download.
         sha256: Checksum in hex.
-        progress: Called after each piece.
+        progress: See :data:`Progress`; called after each received piece.
 
     Raises:
         UserError: The network or the disk fails, or size or checksum differ.
@@ -127,7 +128,7 @@ def fetch(
 
 
 def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None) -> None:
-    """Append the missing bytes to a partial file."""
+    """Download the missing bytes of ``num_bytes``, and append them to a partial file."""
     size = partial.stat().st_size if partial.exists() else 0
     if size > num_bytes:
         partial.unlink()
@@ -166,12 +167,11 @@ def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None)
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follow redirections to http and https only, and never from https to http."""
+    """Handler of redirections: to http and https only, and never from https to http."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> urllib.request.Request | None:
-        """Follow a redirection if its target is allowed."""
         scheme = urlsplit(newurl).scheme.lower()
         if req.type == "https" and scheme != "https":
             raise _failed(req.full_url, f"redirected to {newurl}, which is not https")
@@ -190,7 +190,6 @@ def _verify(path: Path, url: str, sha256: str) -> None:
 
 
 def _failed(url: str, reason: str) -> UserError:
-    """Return the error for a download that did not succeed."""
     fix = "check the network and run the command again, which resumes the download"
     return UserError(f"{url}: {reason}", "a reachable server with the file", fix)
 

@@ -38,7 +38,7 @@ Order = Int[np.ndarray, " items"]
 
 
 class HybridSource:
-    """A mix with exact shares, a pure function of (seed, epoch, index).
+    """Mix of real, virtual and synthetic frames with exact shares.
 
     An epoch holds round(share × samples_per_epoch) items of each source in a random order. Each
     source is traversed in its own shuffled order across epochs, so that its items are used equally
@@ -46,7 +46,7 @@ class HybridSource:
 
     Args:
         real: Real camera frames; None for a real share of 0.
-        real_fraction: Share of ``real``, in [0, 1].
+        real_fraction: Share of ``real`` in the items of an epoch, in [0, 1].
         synthetic_fraction: Share of ``synthetic`` in the remaining items, in [0, 1].
 
     Raises:
@@ -98,12 +98,12 @@ class HybridSource:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return item ``index`` of ``epoch`` from the source that the mix has drawn."""
+        """Return item ``index`` of ``epoch`` from the source of :meth:`locate`."""
         role, cycle, item = self.locate(index, epoch)
         return self._sources[role].sample(item, cycle)
 
     def locate(self, index: int, epoch: int) -> tuple[int, int, int]:
-        """Return (role, the source's epoch, the source's index) of an item."""
+        """Return an item's source (``REAL``, …), and the item's epoch and index in this source."""
         roles, ranks = self._plan(epoch)
         role = int(roles[index])
         position = epoch * self.counts[role] + int(ranks[index])
@@ -112,7 +112,7 @@ class HybridSource:
         return role, cycle, int(self._order(role, cycle, length)[rank])
 
     def _make_plan(self, epoch: int) -> tuple[Order, Order]:
-        """Return each item's source and its rank among that source's items."""
+        """Return each item's source and its rank from 0 among the epoch's items of that source."""
         roles = np.repeat(np.arange(len(_ROLES)), self.counts)
         roles = item_rng(self._seed, Purpose.MIX, epoch).permutation(roles)
         ranks = np.empty_like(roles)
@@ -121,11 +121,11 @@ class HybridSource:
         return roles, ranks
 
     def contains(self, label: str) -> bool:
-        """Return whether any source with a share holds this object."""
+        """Return whether any source with a share above 0 can show the object named ``label``."""
         return any(source.contains(label) for source in self._sources.values())
 
     def describe(self) -> list[SourceInfo]:
-        """Return the entries of all sources with a share."""
+        """Return the entries of all sources with a share above 0."""
         mix = {"seed": self._seed, "samples_per_epoch": self._length}
         entries = []
         for role, source in self._sources.items():
@@ -138,7 +138,7 @@ class HybridSource:
 
 
 class WindowedSource(WrappedSource):
-    """Windows of another source's scaled images that contain the centre of an object.
+    """Random windows, each containing an object's centre, of another source's resized images.
 
     Networks that train on windows of renders need windows of photographs too. Each epoch samples
     object and window again, uniformly among the windows that contain the object's centre, or among
@@ -154,7 +154,7 @@ class WindowedSource(WrappedSource):
         self._image, self._window, self._seed = image, window, seed
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return a window of item ``index``."""
+        """Return a random window of item ``index``, padded to the window size."""
         sample = resize_sample(self._source.sample(index, epoch), self._image)
         rng = item_rng(self._seed, Purpose.WINDOW, epoch, index)
         size = np.minimum(self._window, sample.size)

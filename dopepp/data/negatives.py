@@ -1,6 +1,6 @@
-"""Sources of camera frames without the objects: images, scenes, and a mix of several kinds.
+"""Sources of frames without objects to learn: photos, renders of other parts, and mixes of both.
 
-Every sample is a whole frame without instances; its ``source`` names the kind.
+Every sample is a whole frame without instances; its ``source`` is the name of its kind of frames.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 
 class PhotoFrames:
-    """Whole images as frames of a camera.
+    """Photos as frames of a camera.
 
-    Images are scaled to cover the frame and cropped at the centre; images of the camera itself
-    stay unchanged. If there are more frames than images, the second round is mirrored, and
-    further rounds show random regions.
+    Photos are scaled to cover the frame and cropped at the centre; photos of the frame's size stay
+    unchanged. If there are more frames than photos, they are used again: every second pass is
+    mirrored, and from the third pass on, frames show random regions of the photos.
 
     Args:
-        images: Images of a folder or of one split of a folder.
-        num_frames: Number of frames (default: the number of images).
+        images: Photos of a folder or of one split of a folder.
+        num_frames: Number of frames (default: the number of photos).
         K: Camera matrix, pixels.
         size: (width, height) of the frames, pixels.
-        seed: Seed of the images' order and regions.
+        seed: Seed of the photos' order and regions.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class PhotoFrames:
         return Sample(image, self.K.copy(), [], None, self.name, key)
 
     def contains(self, label: str) -> bool:
-        """Return False: the images show no object."""
+        """Return False: the photos show no object to learn."""
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Return the identity of the images and the camera."""
+        """Return one entry: the photos, K, the frames' size and the seed."""
         identity = {
             "pictures": self.images.identity(),
             "K": self.K.tolist(),
@@ -87,7 +87,7 @@ class PhotoFrames:
 
 
 class UnlabelledRenders(WrappedSource):
-    """Rendered frames whose objects must not be detected."""
+    """Rendered frames without labels, as their objects must not be detected."""
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return frame ``index`` without instances and depth."""
@@ -99,7 +99,7 @@ class UnlabelledRenders(WrappedSource):
 
 
 class FrameMix:
-    """A mix whose consecutive frames come from the sources in turn.
+    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n.
 
     Args:
         sources: Each has at least ``num_frames / len(sources)`` frames, rounded up.
@@ -125,7 +125,7 @@ class FrameMix:
         return self.sources[source].sample(item, epoch)
 
     def contains(self, label: str) -> bool:
-        """Return whether any source holds this object."""
+        """Return whether any source can show the object named ``label``."""
         return any(source.contains(label) for source in self.sources)
 
     def describe(self) -> list[SourceInfo]:

@@ -29,13 +29,13 @@ NONE: Final = "none"
 def choose_symmetries(
     parts: Sequence[Part], choice: str | Mapping[str, object] | None
 ) -> list[Part]:
-    """Return the parts with the chosen symmetries.
+    """Return the parts with the symmetries that ``choice`` names.
 
     Args:
         parts: Objects to learn.
-        choice: None keeps the symmetries; ``none`` removes them; ``auto`` finds them on the mesh.
-            Another text is a file with an entry for each part, by name. A mapping has entries by
-            name for some parts, and keeps the symmetries of the others.
+        choice: None keeps the parts' symmetries; ``none`` removes them; ``auto`` finds them on the
+            mesh. Another text is the path of a file with an entry for each part, by name. A mapping
+            has entries by name for some parts, and keeps the symmetries of the others.
 
     Raises:
         UserError: A file or an entry is missing or wrong, or a part has no mesh for ``auto``.
@@ -59,7 +59,7 @@ def choose_symmetries(
 
 
 def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
-    """Return a part with the symmetries of its mesh, and log them.
+    """Return a part with its mesh's symmetries within ``tolerance`` diameters; log their number.
 
     Raises:
         UserError: The part has no mesh.
@@ -86,14 +86,17 @@ def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
-    """Return the ``models_info.json`` entry of a mesh file or built-in part as JSON."""
+    """Return the ``models_info.json`` entry of a mesh file or built-in part as JSON.
+
+    The symmetries are those of :func:`with_symmetries`.
+    """
     entry = bop_models.model_info(with_symmetries(load_part(path, unit), tolerance))
     entry |= {field: entry.get(field, []) for field in bop_models.SYMMETRY_FIELDS}
     return json.dumps(entry, indent=2, ensure_ascii=False)
 
 
 def _read_symmetries(choice: str) -> dict[str, bop_models.Symmetries]:
-    """Return the symmetries in a file by the part's name."""
+    """Return the symmetries (metres) in the file ``choice``, by part name."""
     path = Path(choice)
     if not path.is_file():
         allowed = f"null, {NONE}, {AUTO} or a models_info.json"

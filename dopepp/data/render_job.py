@@ -1,7 +1,8 @@
 """Define a render job from user input, record it, and claim its folder.
 
-The record holds everything that determines the job's bytes, as plain values. A job writes the
-record first. A later job with another record is rejected with the fields that differ.
+The record holds all settings that determine the bytes of the job's files, in JSON types. A job
+claims a folder by writing its record there. A later job with another record is rejected with the
+fields that differ.
 
 To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """
@@ -55,22 +56,22 @@ _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Images to render, independent of processes and shards."""
+    """Definition of the images to render, independent of processes and shards."""
 
-    factory: Factory  # renders image (0, index)
+    factory: Factory  # renders scene (epoch 0, index)
     layout: str
     views: int  # cameras of each scene
-    record: Mapping[str, Any]  # the settings as plain values; equal records give equal bytes
+    record: Mapping[str, Any]  # settings in JSON types; equal records give equal files
 
     def writer(self, root: Path) -> Writer:
-        """Return a writer of images in the job's layout to the data set in ``root``."""
+        """Return a writer in the job's layout to the data set in folder ``root``."""
         writer = _find_writer(self.layout)(root, self.factory.parts)
         if self.views > 1:
             writer.chunk_size = self.views  # a folder for each static scene
         return writer
 
     def sample(self, index: int) -> Sample:
-        """Render an image; consecutive images are the views of a scene."""
+        """Render an image: view ``index % views`` of scene ``index // views``."""
         scene, view = divmod(index, self.views)
         rendered = self.factory.render(0, scene, view=view)
         sample = rendered_sample(rendered, "virtual", str(index))
@@ -99,22 +100,22 @@ def make_job(
 
     Args:
         parts: Built-in names, mesh files, or ``NAME=FILE`` to name a file's part.
-        unit: Unit of the mesh files; None for the default.
-        preset: Name of a preset.
-        changes: ``field.field=value`` with a value in YAML.
+        unit: Unit of the mesh files; None for the unit of the format, otherwise millimetres.
+        preset: Name of a preset, which defines the random scenes.
+        changes: Changed fields of the preset as ``field.field=value``, the value in YAML.
         size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels for :meth:`Preset.reframed`; None
             for the preset's size.
-        seed: Seed of the whole job.
+        seed: Seed of all random choices of the job.
         backgrounds: Value for :func:`~dopepp.virtual.backgrounds.find_backgrounds`.
-        negatives: Parts among the distractors, written like ``parts``.
-        renderer: Name of a renderer.
+        negatives: Parts to show as distractors without labels, written like ``parts``.
+        renderer: Name of a renderer, see :mod:`dopepp.virtual.renderers`.
         layout: Key of :data:`WRITERS`.
         camera: File of the camera to simulate; None for the preset's camera.
         working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
-        views: Cameras of each scene, which is then a folder; BOP only.
+        views: Number of cameras of each scene. More than 1 gives a folder per scene; BOP only.
 
     Raises:
-        UserError: A value is not usable.
+        UserError: An argument is invalid, or a file is missing or invalid.
     """
     _find_writer(layout)
     check("--views", views, int, Range(1, MAX_VIEWS))
@@ -158,7 +159,6 @@ def make_job(
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    """Import and return the class of a layout's writer."""
     if layout not in WRITERS:
         fix = "pass --format with one of these names"
         raise UserError(f"format {layout!r}", ", ".join(WRITERS), fix)
@@ -168,7 +168,7 @@ def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
 
 
 def named_part(text: str, unit: str | None) -> Part:
-    """Load a part from a text as in :func:`make_job`."""
+    """Load a built-in part by name, or a part from a mesh file, given as FILE or ``NAME=FILE``."""
     match = None if Path(text).exists() else _NAMED.fullmatch(text)
     if match is None:
         return load_part(text, unit)
@@ -178,7 +178,7 @@ def named_part(text: str, unit: str | None) -> Part:
 def _in_camera(
     scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
 ) -> Preset:
-    """Return the preset with the camera of a file, and log the parts' sizes in its images."""
+    """Return the preset with a file's camera and distance (metres); log the parts' image sizes."""
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
@@ -246,13 +246,13 @@ def is_claimed(root: Path) -> bool:
 
 
 def claim(root: Path, record: Mapping[str, Any]) -> None:
-    """Claim a folder for a job, and remove the files of interrupted writes.
+    """Reserve a folder for a job by its record, and remove the files of interrupted writes.
 
-    A folder that this job has claimed before is accepted.
+    A folder with an equal record is accepted.
 
     Args:
         root: Folder of the data set.
-        record: Settings of the job.
+        record: Settings of the job, see :class:`RenderJob`.
 
     Raises:
         UserError: The folder is not writable, or holds another job or other files.
@@ -270,7 +270,7 @@ def claim(root: Path, record: Mapping[str, Any]) -> None:
 
 
 def _write_record(root: Path, record: Mapping[str, Any]) -> None:
-    """Write the record of a job to a new folder, or compare it with the record in the folder."""
+    """Write a job's record to a new folder; raise a UserError if the folder has another record."""
     path = root / RECORD_FILE
     # Listed before the check for a record, because other shards write after their record.
     names = sorted(entry.name for entry in root.iterdir())
@@ -290,7 +290,7 @@ def _write_record(root: Path, record: Mapping[str, Any]) -> None:
 
 
 def _differences(stored: object, current: object, where: str) -> Iterator[str]:
-    """Yield each different field with both values."""
+    """Yield a text for each field below ``where`` that differs, with its path and both values."""
     if isinstance(stored, dict) and isinstance(current, dict):
         for key in current | stored:
             field = f"{where}.{key}" if where else str(key)

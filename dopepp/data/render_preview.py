@@ -1,4 +1,4 @@
-"""Preview the first images of a job on a sheet before rendering thousands."""
+"""Preview the first scenes of a render job on a contact sheet before rendering thousands."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _AXIS_LENGTH: Final = 0.5  # length of a drawn axis, diameters
 
 
 def write_preview(job: RenderJob, out: Path) -> Path:
-    """Write a contact sheet of the job's first images, and return its path.
+    """Write a contact sheet of the job's first scenes (:func:`preview_sheet`); return its path.
 
     Args:
-        job: The job.
+        job: Definition of the images.
         out: A PNG file, or the data set's folder; the sheet is then ``FOLDER.preview.png``.
 
     Raises:
@@ -58,7 +58,7 @@ def write_preview(job: RenderJob, out: Path) -> Path:
 
 
 def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> RGBImage:
-    """Render a job's first images into rows of image and labels, below a line per part."""
+    """Return a sheet with a row of :func:`scene_tiles` per scene, below a text line per part."""
     tiles: list[Tile] = []
     for index in range(num_scenes):
         tiles += scene_tiles(factory.render(0, index), f"image {index}")
@@ -68,7 +68,7 @@ def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> RGBImage:
 
 
 def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
-    """Yield an image, its cuboids and axes, its masks and its depth."""
+    """Yield captioned tiles: the image, cuboids and axes on it, masks on it, and its depth."""
     sample = rendered_sample(rendered, "virtual", name)
     width, height = sample.size
     scene = rendered.scene
@@ -91,7 +91,7 @@ def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
 
 
 def _draw_poses(rendered: Rendered, sample: Sample) -> RGBImage:
-    """Draw cuboids in the masks' colours, and the axes of the object frames."""
+    """Return the image with cuboids in the masks' colours and the axes of the object frames."""
     frames = [
         Wireframe(instance.keypoints, COLOURS[number % len(COLOURS)])
         for number, instance in enumerate(sample.instances)

@@ -1,7 +1,7 @@
 """Render a data set: render missing images, finalize complete chunks, and show the progress.
 
-A job's images form chunks, which are finalized when they are complete. A shard is a contiguous part
-of the job, which may begin and end within a chunk.
+A job's images form chunks. Finalizing a complete chunk writes the files that its images share. A
+shard is a contiguous part of the job, which may begin and end within a chunk.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 ENGINES: Final = ("local", "ray")
 MAX_WORKERS: Final = 1024  # no machine has more cores: a larger number is a typing error
-_LINE_EVERY_S: Final = 30.0
+_LINE_EVERY_S: Final = 30.0  # interval of progress lines in the log
 
 OpenPool = Callable[[bytes], Pool]
 """Opens a pool for the pickled :class:`RenderTasks` of a job."""
@@ -45,7 +45,7 @@ OnProgress = Callable[[int, int], None]
 
 @dataclass
 class RenderReport:
-    """Numbers and times of a run."""
+    """Numbers of images and times of a rendering run."""
 
     num_images: int  # images of the shard
     num_rendered: int = 0  # images rendered by this run
@@ -75,19 +75,19 @@ def run(
     engine: str = "local",
     ray_address: str | None = None,
 ) -> RenderReport:
-    """Render missing images and show the progress on stderr.
+    """Render the images of a job that its folder lacks, and show the progress on stderr.
 
     Args:
-        job: The job.
+        job: Definition of the images.
         out: Folder of the data set.
-        num: Number of images of the whole job.
-        shard: Part of the job, ``i/n``.
+        num: Number of images of the whole job, required.
+        shard: Part of the job to render, ``i/n`` with i from 0 to n − 1.
         workers: Number of processes; None for one per core.
         engine: An entry of :data:`ENGINES`.
         ray_address: ``host:port`` of a Ray cluster; None starts a cluster on this machine.
 
     Raises:
-        UserError: A value is not usable.
+        UserError: An argument is invalid, or the folder holds another job or other files.
         StoppedError: The disk is full, or a worker has died.
     """
     if num is None:
@@ -98,7 +98,7 @@ def run(
 
 
 def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPool:
-    """Check the options, and return the function that opens the pool."""
+    """Return the function that opens the process pool, or raise a UserError for wrong options."""
     workers = available_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         fix = "pass an allowed number, or leave out --workers"
@@ -116,7 +116,7 @@ def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPo
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several equal and contiguous parts of a job."""
+    """Part ``number`` (from 0) of ``total`` equal and contiguous parts of a job."""
 
     number: int = 0
     total: int = 1
@@ -144,7 +144,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Chunk:
-    """A shard's share of a chunk."""
+    """The part of a chunk that a shard renders."""
 
     number: int
     required: range  # the job's images in the chunk, from all shards, needed to finalize the chunk
@@ -172,7 +172,7 @@ class RenderTask:
 
 
 class RenderTasks:
-    """Performs tasks of a job in a process of a pool, on one thread."""
+    """Callable that performs the tasks of a job in a process of a pool, on one thread."""
 
     def __init__(self, job: RenderJob, root: Path) -> None:
         self._job, self._root = job, root
@@ -222,15 +222,15 @@ def render_dataset(
     folder simultaneously; the shard that completes a chunk finalizes it.
 
     Args:
-        job: The job.
+        job: Definition of the images.
         root: Folder of the data set.
         num_items: Number of images of the whole job.
-        open_pool: Opens the pool of processes.
+        open_pool: See :data:`OpenPool`.
         shard: Part of the job; None for the whole job.
-        on_progress: Receives the progress.
+        on_progress: See :data:`OnProgress`.
 
     Raises:
-        UserError: The number or the folder is not usable.
+        UserError: The number is out of range, or the folder holds another job or other files.
         StoppedError: The disk is full, or a worker has died.
     """
     if not 1 <= num_items <= MAX_ITEMS:
@@ -262,7 +262,7 @@ def render_dataset(
 
 
 class _Run:
-    """Remaining and finished tasks of a run."""
+    """Remaining tasks of a rendering run, and the report of finished tasks."""
 
     def __init__(self, chunks: list[Chunk], report: RenderReport) -> None:
         self.report = report
@@ -286,7 +286,6 @@ class _Run:
             yield RenderTask(number, self._chunks[number].required, finalizes=True)
 
     def count(self, task: RenderTask, render_s: float, write_s: float) -> None:
-        """Count the images and times of a finished task."""
         if task.finalizes:
             return
         self.report.render_s += render_s
@@ -299,7 +298,7 @@ class _Run:
 
 
 class ProgressDisplay:
-    """Context that shows progress as a bar or, without a terminal, as lines in the log."""
+    """Context manager that shows progress as a bar or, without a terminal, as lines in the log."""
 
     def __init__(self, console: Console) -> None:
         self._bar = rich_progress.Progress(
@@ -342,6 +341,5 @@ class _RateColumn(rich_progress.ProgressColumn):
     """Images per second over the last half minute; empty while unknown."""
 
     def render(self, task: rich_progress.Task) -> Text:
-        """Return the rate as text."""
         speed = task.finished_speed or task.speed
         return Text(f"{speed:.1f}/s" if speed else "", style="progress.data.speed")

@@ -1,8 +1,8 @@
 """Provide virtual images as a source, rendered on demand or cached.
 
 Training, validation and test are three disjoint index ranges of a factory, so they share no image.
-Only training images change with the epoch. Cached images are images of epoch 0; masking and
-augmentation are applied later and differ between epochs.
+Only training images change with the epoch. The cache holds images of epoch 0. Masking and
+augmentation follow the cache, so they differ between epochs.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ FIRST_INDEX: Final[dict[Split, int]] = {"train": 0, "val": MAX_ITEMS, "test": 2 
 
 
 class RenderedSource:
-    """A range of a factory's images.
+    """Source of the images of one split, which a factory renders on demand.
 
     Args:
         split: One of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
-        scale: Magnification of the parts, by moving the camera closer.
+        scale: Factor by which the camera is closer to the mean of the targets' centres.
 
     Raises:
         ValueError: The scale is not positive and finite.
@@ -69,7 +69,7 @@ class RenderedSource:
         return self._num_items
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Render item ``index``.
+        """Render image ``index`` of the split.
 
         Raises:
             IndexError: The index is negative, or not below the number of items.
@@ -81,11 +81,11 @@ class RenderedSource:
         return rendered_sample(rendered, self.name, f"{self.split}/{epoch}/{index}")
 
     def contains(self, label: str) -> bool:
-        """Return whether the factory renders this object."""
+        """Return whether the part named ``label`` is a target of the factory."""
         return any(part.name == label for part in self.factory.parts)
 
     def describe(self) -> list[SourceInfo]:
-        """Return the range, the factory's settings and the parts' hashes."""
+        """Return one entry: the split, the factory's settings, and hashes of the parts' meshes."""
         identity: dict[str, object] = {
             "split": self.split,
             "seed": self.factory.seed,
@@ -102,7 +102,7 @@ class RenderedSource:
 
 
 def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
-    """Turn a rendered image into a sample of all its targets, including hidden targets."""
+    """Convert a rendered image to a sample with all its targets, even fully occluded targets."""
     scene = rendered.scene
     instances = [
         Instance(
@@ -126,7 +126,7 @@ _FILLED: Final = 1 << 32
 
 
 class CachedSource(WrappedSource):
-    """Caches another source's items of epoch 0, resized to the network's input size.
+    """Cache of another source's samples of epoch 0, resized to fit the network's input.
 
     The cache is an array with a slot for each item, in memory shared by forked workers or in a file
     shared by runs. The first request for an item fills its slot: the content, then the checksum. A
@@ -134,10 +134,11 @@ class CachedSource(WrappedSource):
     processes that fill a slot simultaneously write the same bytes.
 
     Args:
-        input_size: (width, height) that bounds the resized images; None keeps size and depth.
+        input_size: (width, height) that bounds the resized images, which lose their depth; None
+            keeps size and depth.
         folder: Folder of the files, in subfolders named by a hash of everything that determines the
             items; None keeps the items in memory.
-        identity: Determines the items besides the source's description, e.g. the code's version.
+        identity: Version of the code, or other text that determines the items besides the source.
 
     Raises:
         UserError: The cache needs more than half of the machine's memory, or the disk is full.
@@ -186,7 +187,7 @@ class CachedSource(WrappedSource):
         return self._load(index)
 
     def _shared_array(self, name: str, dtype: np.dtype[Any]) -> Shaped[np.ndarray, " items"]:
-        """Map memory that forked processes share or, with a folder, a file, at first zeros."""
+        """Return an array of one entry per item, initially 0, in shared memory or a file."""
         size = dtype.itemsize * len(self._source)
         if self.folder is None:
             return np.frombuffer(mmap.mmap(-1, size), dtype)  # only written pages take memory
@@ -204,7 +205,7 @@ class CachedSource(WrappedSource):
             raise UserError(problem, "a folder with at least this much free space", fix) from error
 
     def _resized(self, index: int) -> Sample:
-        """Return an item of the source at the cached size."""
+        """Return an item resized to fit ``input_size``, without depth; unchanged without a size."""
         sample = self._source.sample(index, 0)
         if self._input_size is None:
             return sample
@@ -215,7 +216,7 @@ class CachedSource(WrappedSource):
         return zlib.crc32(self._slots[index : index + 1].view("u1").data) | _FILLED
 
     def _store(self, index: int, sample: Sample) -> None:
-        """Write a sample to its slot in the cache."""
+        """Write a sample to its slot, and then the slot's checksum."""
         self._check(sample)
         slot = self._slots[index]
         slot["image"], slot["K"], slot["key"] = sample.image, sample.K, sample.key
@@ -233,7 +234,7 @@ class CachedSource(WrappedSource):
         self._checksums[index] = self._checksum(index)
 
     def _check(self, sample: Sample) -> None:
-        """Reject samples that a slot cannot represent."""
+        """Raise a ValueError for a sample that a slot cannot represent."""
         if len(sample.instances) > _MAX_INSTANCES:
             raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
         layout = (self._shape, self._source_name, self._has_depth)
@@ -245,7 +246,6 @@ class CachedSource(WrappedSource):
             raise ValueError(f"one of {texts} has more than {_TEXT_LENGTH} characters")
 
     def _load(self, index: int) -> Sample:
-        """Read a sample from its slot in the cache."""
         slot = self._slots[index]
         instances = [
             Instance(
@@ -268,7 +268,7 @@ class CachedSource(WrappedSource):
 
 
 def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
-    """Return the layout of a cached sample."""
+    """Return the dtype of a slot: one sample with an image of ``shape``."""
     instance = np.dtype(
         [
             ("T_cam_obj", "f8", (4, 4)),

@@ -23,17 +23,18 @@ from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, crop_came
 
 @dataclass
 class Instance:
-    """An object on an image.
+    """An annotated object on an image.
 
     Attributes:
+        label: Name of the object's part.
         T_cam_obj: Rigid transform from object to camera frame, (4, 4), metres, float64.
-        keypoints: Projected cuboid corners and centroid, pixels, NaN behind the camera.
+        keypoints: Projected cuboid corners, then its centroid, pixels; NaN behind the camera.
         visible_fraction: Visible share of the object's full silhouette, occlusion and truncation
             both counted, in [0, 1].
         mask: Visible pixels, or None if the source has no mask.
-        wanted: Whether the test set's list of targets contains the object; None without a list.
-        masked_fraction: Share of the visible pixels that masking has covered;
-            ``visible_fraction`` and ``mask`` are already reduced by it.
+        wanted: Whether the test set lists the object as a target to find; None without a list.
+        masked_fraction: Share of the visible pixels that artificial patches have covered; these
+            pixels no longer count in ``visible_fraction`` and ``mask``.
     """
 
     label: str
@@ -51,11 +52,11 @@ class Sample:
 
     Attributes:
         K: Camera matrix in pixels of this image, float64.
-        depth: Metres along z, float32, 0 if unknown; None if the source has no depth.
+        depth: Metres along the camera's z axis, float32, 0 if unknown; None without depth.
         source: Name of the source, e.g. ``ycb_video/data``.
-        key: The item within its source, e.g. ``0050/000003``.
-        T_world_cam: Pose of the camera in a static scene; None if unknown.
-        others: Further images of the static scene, with their cameras' poses.
+        key: Name of the image within its source, e.g. ``0050/000003``.
+        T_world_cam: Rigid transform from camera to world frame, (4, 4), metres; None if unknown.
+        others: Further images of the same static scene, each with ``T_world_cam``.
     """
 
     image: RGBImage
@@ -69,30 +70,30 @@ class Sample:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) in pixels."""
+        """(width, height) of the image, pixels."""
         return self.image.shape[1], self.image.shape[0]
 
 
 class SampleSource(Protocol):
-    """A map-style data set; item ``index`` is a pure function of (its seed, epoch, index)."""
+    """A data set with random access; a sample depends only on (the source's seed, epoch, index)."""
 
     name: str
 
     def __len__(self) -> int:
-        """Return the number of items of an epoch."""
+        """Return the number of samples per epoch."""
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return item ``index`` of ``epoch``."""
+        """Return sample ``index`` (from 0) of ``epoch``."""
 
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """Content of a source, for the log at the start and the data fingerprint.
+    """Content of a source, for the log at the start of training and the fingerprint of the data.
 
     Attributes:
-        identity: Everything that determines the items, as values that JSON can encode.
-        num_instances: Instances of each object; empty if counting is expensive.
-        num_per_epoch: Number of the source's images in an epoch (default: all).
+        identity: Settings and content hashes that determine the samples, in JSON types.
+        num_instances: Number of instances by object name; empty if counting is slow.
+        num_per_epoch: Number of images that a mix takes per epoch (default: all).
     """
 
     name: str
@@ -103,21 +104,21 @@ class SourceInfo:
 
 
 class DescribedSource(SampleSource, Protocol):
-    """A source for the DataModule, which also describes its content."""
+    """A sample source that also describes its content, as the DataModule requires."""
 
     def describe(self) -> list[SourceInfo]:
-        """Return an entry for each elementary source."""
+        """Return one entry, or an entry for each combined source of a mix."""
 
     def contains(self, label: str) -> bool:
-        """Return whether any item of any epoch can hold an instance of this object."""
+        """Return whether a sample of any epoch can show the object named ``label``."""
 
 
 class WrappedSource:
-    """Base of the sources that change the samples of another source.
+    """Base class of sources that modify the samples of another source.
 
     Args:
-        source: The other source.
-        **identity: Settings that determine the change.
+        source: Source of the unmodified samples.
+        **identity: Settings of the modification, added to ``SourceInfo.identity``.
     """
 
     def __init__(self, source: DescribedSource, **identity: object) -> None:
@@ -127,11 +128,11 @@ class WrappedSource:
         return len(self._source)
 
     def contains(self, label: str) -> bool:
-        """Return whether the other source contains this object."""
+        """Return whether the unmodified source contains the object."""
         return self._source.contains(label)
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the other source, with the settings of the change."""
+        """Describe the unmodified source, and add the settings of the modification."""
         return [
             replace(info, identity={**info.identity, **self._identity})
             for info in self._source.describe()
@@ -139,9 +140,10 @@ class WrappedSource:
 
 
 def silhouette(instance: Instance, shape: Shape) -> Mask:
-    """Return the instance's mask, or else the hull of its cuboid (empty behind the camera).
+    """Return the instance's mask or, without a mask, the filled hull of its projected cuboid.
 
     The hull contains the object's outline, so a crop that avoids the hull does not show the object.
+    The hull is empty if the cuboid is partly behind the camera.
     """
     if instance.mask is not None:
         return instance.mask
@@ -156,9 +158,9 @@ def silhouette(instance: Instance, shape: Shape) -> Mask:
 def hull_areas(
     points_px: Float[np.ndarray, "points 2"], shape: tuple[int, ...]
 ) -> tuple[float, float]:
-    """Return the area (px²) of the points' hull inside an image (height, width), and in total.
+    """Return the area (px²) of the points' convex hull inside an image of ``shape``, and in total.
 
-    Points behind the camera (NaN) are ignored.
+    Points behind the camera (NaN) are ignored. Fewer than three points have no area.
     """
     points = points_px[np.isfinite(points_px).all(axis=1)].astype(np.float32)
     if len(points) < 3:
@@ -174,15 +176,16 @@ def hull_areas(
 def reduce_visibility(
     before: Instance, after: Instance, shapes: tuple[Shape, Shape], scale: float = 1.0
 ) -> Instance:
-    """Reduce the visible fraction of an object by its loss in a crop or warp of the image.
+    """Return ``after`` with the visible fraction that a crop or warp of the image leaves.
 
-    The loss is a share of the mask's pixels or, without a mask, of the cuboid's outline.
+    The fraction is multiplied by the share of the mask's pixels (without a mask, of the area of the
+    cuboid's hull) that the new image still shows.
 
     Args:
-        before: The object on the image.
+        before: The object on the original image.
         after: The object with keypoints and mask of the new image.
-        shapes: (height, width) of the image and of the new image.
-        scale: Pixels of the new image per pixel of the image.
+        shapes: (height, width) of the original image and of the new image, pixels.
+        scale: Length in the new image, pixels, of a pixel of the original image.
     """
     area_before, area_after = (
         hull_areas(view.keypoints, shape)[0] if view.mask is None else float(view.mask.sum())
@@ -193,7 +196,7 @@ def reduce_visibility(
 
 
 class Purpose(IntEnum):
-    """Purpose of a random generator; the numbers determine the data and must not change."""
+    """Purpose of a random generator; its number enters the seed, so it must not change."""
 
     SHUFFLE = 101
     MIX = 102
@@ -205,16 +208,16 @@ class Purpose(IntEnum):
 
 
 def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generator:
-    """Return an item's random generator, independent of workers, ranks and resuming."""
+    """Return a random generator that depends only on the four arguments, not on worker or rank."""
     # The purpose comes last, because a generator ignores trailing zeros: the factory draws its
     # scenes from [seed, epoch, index], which equals [seed, epoch, index, 0].
     return np.random.default_rng([seed, epoch, index, int(purpose)])
 
 
 def resize_nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """Resize by nearest neighbour: target pixel j takes source pixel ⌊(j + ½) / s⌋.
+    """Resize by nearest neighbour: target pixel j takes source pixel ⌊(j + ½) / scale⌋.
 
-    Integer arithmetic is exact; ``cv2.INTER_NEAREST`` takes ⌊j / s⌋, half a pixel off.
+    Integer arithmetic is exact; ``cv2.INTER_NEAREST`` takes ⌊j / scale⌋, half a pixel off.
     """
     rows = (2 * np.arange(height) + 1) * image.shape[0] // (2 * height)
     columns = (2 * np.arange(width) + 1) * image.shape[1] // (2 * width)
@@ -222,7 +225,7 @@ def resize_nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]
 
 
 def _map_pixels(sample: Sample, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Sample:
-    """Apply a function to the depth image and the masks."""
+    """Return a copy of a sample with a function applied to its depth image and masks."""
 
     def mapped(pixels: NDArray[Any] | None) -> NDArray[Any] | None:
         return None if pixels is None else function(pixels)
@@ -232,7 +235,7 @@ def _map_pixels(sample: Sample, function: Callable[[NDArray[Any]], NDArray[Any]]
 
 
 def resize_sample(sample: Sample, input_size: Size) -> Sample:
-    """Scale a sample to fit into ``input_size`` like ``Letterbox``, without padding."""
+    """Resize a sample to fit into ``input_size`` at its aspect ratio, without padding."""
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
         return sample
@@ -245,7 +248,7 @@ def resize_sample(sample: Sample, input_size: Size) -> Sample:
 
 
 def pad_sample(sample: Sample, input_size: Size) -> Sample:
-    """Pad with zeros on the right and at the bottom; K and keypoints do not change."""
+    """Pad a sample to ``input_size`` with zeros at the right and bottom; K and keypoints stay."""
     width, height = sample.size
     if (width, height) == tuple(input_size):
         return sample
@@ -258,7 +261,7 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
 
 
 def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
-    """Crop (width, height) pixels, with reduced visible fractions (:func:`reduce_visibility`)."""
+    """Crop a sample to ``size`` pixels at (left, top), with matching K, keypoints and fractions."""
     width, height = size
 
     def cut(pixels: NDArray[Any]) -> NDArray[Any]:

@@ -46,7 +46,7 @@ _ATTEMPTS: Final = 100
 
 
 class Writer(Protocol):
-    """Writes samples into a folder; each process makes a writer from (folder, parts).
+    """Writer of samples into a folder; each process makes a writer from (folder, parts).
 
     A file exists completely or not at all. The bytes of an item depend on (index, sample) only.
     """
@@ -74,7 +74,7 @@ class Writer(Protocol):
 
 
 def share_slice(num_items: int, part_of: tuple[float, float], name: str) -> slice:
-    """Return the slice of ``num_items`` items for a share (first, last) in fractions.
+    """Return the slice of ``num_items`` items between two fractions (first, last) in [0, 1].
 
     Equal bounds are rounded equally, so adjacent shares neither overlap nor leave a gap.
 
@@ -101,7 +101,7 @@ def make_instance(
     mask: Mask | None,
     shape: Shape,
 ) -> Instance:
-    """Return an annotated object as an instance.
+    """Return the instance of a part at a pose, on an image of ``shape``.
 
     A visible fraction of NaN is replaced by an estimate: the number of mask pixels (without a mask,
     the hull's area inside the image) divided by the area of the convex hull of the projected ADD
@@ -116,7 +116,7 @@ def make_instance(
 
 
 def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Read the JSON object that a writer extends; return an empty one if there is no file.
+    """Read a JSON object that a writer extends; return an empty object if the file is missing.
 
     Raises:
         UserError: The file is not a JSON object.
@@ -132,18 +132,18 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
 
 
 def encode_by_key(content: Mapping[str, object]) -> bytes:
-    """Encode a JSON object with one line per key."""
+    """Encode a JSON object as text with one line per key."""
     lines = [f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items()]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 def stage_item(path: Path, content: bytes) -> None:
-    """Write an item to the staging folder; retry if another process removes the folder."""
+    """Write an item to a file in the staging folder, even if other processes remove the folder."""
     _retry(lambda: write_file(path, content))
 
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
-    """Return the staged items in order; none if a finalizer removes the folder."""
+    """Return the staged files in order, named by a number; none if the folder is missing."""
     try:
         return sorted(staging.glob(f"[0-9]*{suffix}"))
     except FileNotFoundError:
@@ -176,13 +176,12 @@ def lock_staging(staging: Path) -> Iterator[None]:
 
 
 def _open(path: Path) -> int:
-    """Open or create a lock file; return its descriptor."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return os.open(path, os.O_RDWR | os.O_CREAT)
 
 
 def _retry(act: Callable[[], T]) -> T:
-    """Repeat ``act``, which needs a folder that another process may remove at any moment."""
+    """Repeat ``act`` until its folder exists; another process may remove the folder meanwhile."""
     # A folder removed before its use is not found; a folder removed within ``mkdir`` "exists".
     for _ in range(_ATTEMPTS - 1):
         with suppress(FileNotFoundError, FileExistsError):

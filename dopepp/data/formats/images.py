@@ -67,7 +67,7 @@ def decode_image(
 def image_shape(
     node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Shape | None:
-    """Decode an image like :func:`decode_image`, and return its (height, width)."""
+    """Return an image's (height, width) like :func:`decode_image`; if damaged, from the header."""
     image = decode_image(node, content, modes)
     if image is not None:
         return image.height, image.width
@@ -75,7 +75,7 @@ def image_shape(
 
 
 def header_shape(file: Path | io.BytesIO) -> Shape | None:
-    """Return the (height, width) in the header of a truncated image, or None."""
+    """Return the (height, width) in an image's header, even if truncated; None if unreadable."""
     try:
         with Image.open(file, formats=FORMATS) as image:
             width, height = image.size
@@ -99,7 +99,7 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     """Decode a depth image as metres, float32; 0 is unknown.
 
     Args:
-        content: The image file.
+        content: Bytes of the image file.
         where: Name of the image in messages.
         depth_scale: Millimetres per unit; NaN if not stated.
         shape: (height, width) of the colour image.
@@ -154,7 +154,7 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
     Args:
         node: The file.
         shape: Expected (height, width); None to allow any shape.
-        colour: Whether to return None for several channels without a report.
+        colour: Whether a colour image, whose meaning is unknown, gives None without a report.
     """
     image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
@@ -166,7 +166,7 @@ def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[A
 def check_one_channel(
     node: Node, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
-    """Return an image of one channel and of ``shape``; report any other and return None."""
+    """Return an image of one channel and ``shape``; report any other image and return None."""
     if image is None:
         return None
     if image.ndim != 2:

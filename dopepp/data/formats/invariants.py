@@ -30,7 +30,7 @@ PIXEL_ASPECT: Final = (0.5, 2.0)
 
 
 class Box(NamedTuple):
-    """An axis-aligned box in the image, pixel centres, ends included."""
+    """Axis-aligned box in an image; its ends are coordinates of pixel centres in the box."""
 
     left: float
     top: float
@@ -39,7 +39,7 @@ class Box(NamedTuple):
 
     @classmethod
     def of_points(cls, points_px: Float[np.ndarray, "points 2"]) -> Box | None:
-        """Return the box of points, or None if a coordinate is not finite."""
+        """Return the smallest box around points, or None if a coordinate is not finite."""
         if not len(points_px) or not np.isfinite(points_px).all():
             return None
         (left, top), (right, bottom) = points_px.min(axis=0), points_px.max(axis=0)
@@ -47,14 +47,14 @@ class Box(NamedTuple):
 
     @classmethod
     def of_mask(cls, mask: NDArray[Any]) -> Box | None:
-        """Return the box of a mask's pixels, or None for an empty mask."""
+        """Return the smallest box around a mask's pixels, or None for an empty mask."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         if not len(rows):
             return None
         return cls(float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1]))
 
     def excess_px(self, other: Box) -> float:
-        """Return by how many pixels another box exceeds this box; negative inside."""
+        """Return by how many pixels another box exceeds this box on any side; negative inside."""
         left, top = self.left - other.left, self.top - other.top
         return max(left, top, other.right - self.right, other.bottom - self.bottom)
 
@@ -68,7 +68,7 @@ class Box(NamedTuple):
 
 
 def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
-    """Return why a matrix is not a rotation, or None for a rotation and for NaN."""
+    """Return why a matrix R is not a rotation (R·Rᵀ, determinant); None for a rotation and NaN."""
     if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -107,7 +107,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
 def plausible_camera(
     node: Node, K: CameraMatrix | None, shape: Shape | None
 ) -> CameraMatrix | None:
-    """Return K (pixels), or None if K is missing, damaged or implausible, which is reported."""
+    """Return K (pixels); None if K is missing, not finite or (reported) wrong for the image."""
     if K is None or not np.isfinite(K).all():
         return None
     if shape is None:

@@ -25,10 +25,10 @@ from dopepp.core.json import MAX_BYTES, parse_json, read_json
 _log = logging.getLogger(__name__)
 
 MAX_KEPT: Final = 10_000
-"""Limit of stored defects, which bounds memory; further defects are only counted."""
+"""Largest number of stored defects, which bounds memory; further defects are only counted."""
 
 FARTHEST: Final = 1e9
-"""Largest number in a label, in any unit; its square is exact enough."""
+"""Largest number in an annotation, in any unit; its square is exact enough."""
 
 _IMAGES_A_LINE: Final = 1000  # images per progress line of the log
 
@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 class Problems:
-    """Raises the first problem."""
+    """Receiver of problems that raises the first problem as a UserError."""
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
         """Report a problem.
@@ -55,10 +55,10 @@ class Problems:
         raise UserError(": ".join(filter(None, parts)), allowed, fix)
 
     def report_error(self, path: Path | str, where: str, error: UserError) -> None:
-        """Report an error that another package raised.
+        """Report an error that a function raised while it read a file.
 
         Raises:
-            UserError: In this class, always: the given error.
+            UserError: In this class, always: ``error``.
         """
         raise error
 
@@ -68,11 +68,12 @@ STRICT: Final = Problems()
 
 @dataclass
 class CheckReport(Problems):
-    """Collects all problems as defects.
+    """Receiver of problems that collects all problems of a data set as defects.
 
     Attributes:
         defects: The first ``MAX_KEPT`` defects as ``FILE: FIELD: MESSAGE``, in order.
-        counts: Numbers of defects by the last part of their field.
+        counts: Numbers of defects by the last part of their field, e.g. ``cam_R_m2c``.
+        notes: Remarks that are not defects.
     """
 
     root: Path
@@ -89,7 +90,7 @@ class CheckReport(Problems):
         return self.num_defects == 0
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
-        """Store a defect."""
+        """Store a problem as a defect."""
         where = where.lstrip(".") or "top level"
         self.num_defects += 1
         self.counts[where.rpartition(".")[2]] += 1
@@ -111,7 +112,7 @@ class CheckReport(Problems):
             self.notes.append(text)
 
     def count_image(self) -> None:
-        """Count an image, and log the progress at intervals."""
+        """Count a checked image, and log the progress every 1,000 images."""
         self.num_images += 1
         if self.num_images % _IMAGES_A_LINE == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
@@ -148,7 +149,7 @@ class Node:
         return Node(self.problems, self.path, self.where + step)
 
     def report(self, message: str, allowed: str = "") -> None:
-        """Report a problem."""
+        """Report a problem of this file or field."""
         self.problems.report(self.path, self.where, message, allowed)
 
     def attempt(self, read: Callable[[], T]) -> T | None:
@@ -212,7 +213,7 @@ class Node:
         return float(self.numbers(value, 1)[0])
 
     def entries(self, value: object) -> list[Any]:
-        """Return a list's JSON objects; report other entries and make them empty."""
+        """Return a list's JSON objects; report other entries and replace them by empty objects."""
         if not isinstance(value, list):
             self.report("missing" if value is None else f"{value!r:.60}", "a list")
             return []

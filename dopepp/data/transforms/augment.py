@@ -33,15 +33,17 @@ _Changes = Annotated[Pair, Span(0, math.inf)]
 
 @dataclass(frozen=True)
 class Photometric(Checked):
-    """Random photometric changes, drawn from the item's generator.
+    """Random photometric changes of an image; amounts are sampled uniformly within the limits.
 
     Attributes:
-        brightness: Largest offset, as a share of 255.
+        brightness: Largest offset of all channels in either direction, as a share of 255.
         contrast: Largest relative change of the contrast about mid-grey.
+        saturation: Largest relative change of the chroma.
         hue: Largest hue rotation, radians.
         colour_gain: Largest relative change of each colour channel (white balance).
-        blur_sigma: Range of the blur's sigma, pixels.
+        blur_sigma: Range of the standard deviation of the Gaussian blur, pixels.
         noise_sigma: Range of the noise's standard deviation, grey levels.
+        jpeg_quality: Range of the JPEG quality, 1 (worst) to 100.
     """
 
     brightness: _Change = 0.2
@@ -57,7 +59,7 @@ class Photometric(Checked):
     jpeg_quality: _Changes = (40, 95)
 
     def __call__(self, image: RGBImage, rng: Generator) -> RGBImage:
-        """Return a changed copy of an RGB image."""
+        """Return an augmented copy of an RGB image."""
         image = cv2.transform(image, self._colour_matrix(rng))
         if rng.random() < self.blur_probability:
             image = defocus(image, rng.uniform(*self.blur_sigma))
@@ -68,7 +70,7 @@ class Photometric(Checked):
         return np.asarray(image)
 
     def _colour_matrix(self, rng: Generator) -> Float[np.ndarray, "3 4"]:
-        """Compose all colour changes into one affine map, so that pixels are rounded once."""
+        """Sample all colour changes as one affine map of RGB, so that pixels are rounded once."""
         angle = rng.uniform(-self.hue, self.hue)
         chroma = 1 + rng.uniform(-self.saturation, self.saturation)
         rotation = np.eye(3)

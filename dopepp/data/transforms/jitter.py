@@ -1,6 +1,6 @@
 """Jitter the camera: roll, zoom and shift the image a little.
 
-A training uses each render many times; jitter keeps the network from memorising images. Image,
+Training uses each render many times; jitter keeps the network from memorising images. Image,
 camera matrix, poses and keypoints follow exactly: a camera that rolls about its optical axis and
 zooms sees the same rays at other pixels.
 """
@@ -23,12 +23,12 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 
 @dataclass(frozen=True)
 class CameraJitter(Checked):
-    """Roll, zoom and shift the camera's image at random; new pixels repeat the border.
+    """Random roll, zoom and shift of the camera; pixels from outside the image repeat its border.
 
     Attributes:
-        roll_deg: Largest rotation of the image about its centre, in either direction.
-        zoom: Range of the factor on the focal length, log-uniform.
-        shift: Largest shift in each direction, as a share of the image's sides.
+        roll_deg: Largest rotation of the image about its centre, in either direction, degrees.
+        zoom: Range of the factor on the focal length, sampled log-uniformly.
+        shift: Largest shift in each direction, as a share of the image's width and height.
     """
 
     roll_deg: Annotated[float, Range(0, 180, "degrees")] = 20.0
@@ -36,7 +36,7 @@ class CameraJitter(Checked):
     shift: Annotated[float, Range(0, 0.49, "share")] = 0.1
 
     def __call__(self, sample: Sample, rng: Generator) -> Sample:
-        """Return a copy seen by the jittered camera, with reduced visible fractions."""
+        """Return the sample as the jittered camera sees it, without depth."""
         size = np.array(sample.size)
         middle = (size - 1) / 2
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))

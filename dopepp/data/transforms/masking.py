@@ -25,17 +25,19 @@ from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
 MIN_CONTRAST: Final = 3.0
-"""Smallest standard deviation of a colour channel of a crop that is not solid, grey levels."""
+"""Standard deviation that a colour channel of a crop must reach to have contrast, grey levels."""
 
-MAX_DRAWS: Final = 8  # Largest number of crops to draw from an image.
+MAX_DRAWS: Final = 8  # Largest number of crops to sample from an image.
 
 
 class BackgroundCrops:
-    """Samples crops of an image that show no object.
+    """Sampler of rectangular crops of an image that show no object.
 
     Args:
         image: RGB, without padding, as padding is not background.
         silhouettes: Pixels of each object, which no crop contains.
+        min_contrast: See :func:`has_contrast`.
+        max_draws: Number of random crops that :meth:`draw` tries.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class BackgroundCrops:
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
     def draw(self, size: Size, rng: Generator) -> RGBImage | None:
-        """Return a random crop of (height, width), or None if no sampled crop has contrast."""
+        """Return the first of ``max_draws`` random (height, width) crops with contrast, or None."""
         windows = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(windows) else 0):
             crop = self._crop(int(rng.choice(windows)), size)
@@ -61,9 +63,9 @@ class BackgroundCrops:
         return None
 
     def search(self, size: Size, rng: Generator) -> RGBImage | None:
-        """Return a random crop of (height, width) that has contrast.
+        """Return a random crop among all crops of (height, width) that have contrast.
 
-        Without such a crop, return a crop with at least two colours, or None.
+        If there are none, return a random crop with at least two colours, or None.
         """
         free = self._is_free(size)
         if not free.any():
@@ -80,7 +82,7 @@ class BackgroundCrops:
         return None
 
     def largest(self, size: Size, rng: Generator) -> RGBImage | None:
-        """Return a crop of (height, width), halved until it fits the background, or None."""
+        """Return a crop of (height, width), halved until :meth:`search` finds one, or None."""
         height, width = size
         while True:
             crop = self.draw((height, width), rng)
@@ -91,7 +93,7 @@ class BackgroundCrops:
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
     def _is_free(self, size: Size) -> Bool[np.ndarray, "rows columns"]:
-        """Return for each window, by its top left corner, whether it is free of objects."""
+        """Return for each window of ``size``, by its top left corner, if it shows no object."""
         return np.asarray(_windows(self._integral, size) == 0)
 
     @cached_property
@@ -101,7 +103,7 @@ class BackgroundCrops:
         return sums, squares
 
     def _crop(self, window: int, size: Size) -> RGBImage:
-        """Return a window by its number, counted row by row."""
+        """Return the window with this number, counting top left corners row by row."""
         row, column = divmod(window, self.image.shape[1] - size[1] + 1)
         return self.image[row : row + size[0], column : column + size[1]]
 
@@ -118,12 +120,12 @@ def _windows(integral: np.ndarray, size: Size) -> np.ndarray:
 
 
 def has_contrast(crop: RGBImage, min_contrast: float) -> bool:
-    """Return whether a crop is more than a solid colour."""
+    """Return whether a channel's standard deviation is at least ``min_contrast`` grey levels."""
     return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
 
 
 def mask_slices(mask: Mask) -> tuple[slice, slice]:
-    """Return the slices of rows and columns that a mask's pixels span."""
+    """Return the row slice and column slice of the bounding box of a mask that is not empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
@@ -131,7 +133,10 @@ def mask_slices(mask: Mask) -> tuple[slice, slice]:
 def cover_instances(
     instances: Sequence[Instance], silhouettes: Sequence[Mask], covered: Mask
 ) -> list[Instance]:
-    """Remove covered pixels from instances; keypoints and poses stay."""
+    """Remove covered pixels from masks and visible fractions; keypoints and poses stay.
+
+    The covered share of an instance's silhouette becomes its ``masked_fraction``.
+    """
     remaining = []
     for instance, visible in zip(instances, silhouettes, strict=True):
         num_visible = int(np.count_nonzero(visible))
@@ -148,13 +153,14 @@ def cover_instances(
 
 @dataclass(frozen=True)
 class RandomMask(Checked):
-    """Cover each instance with a background patch, with a probability.
+    """Random background patch on each instance.
 
     Attributes:
+        probability: Probability that an instance gets a patch.
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
-        min_contrast: Grey levels of standard deviation that a crop needs in a colour channel.
-        max_draws: Number of crops to try per image; the instance stays uncovered if all fail.
+        min_contrast: Contrast that a patch should have, see :func:`has_contrast`.
+        max_draws: Number of random crops to try per patch size, and then in other images.
     """
 
     probability: Share = 0.5
@@ -185,7 +191,7 @@ class RandomMask(Checked):
         return replace(sample, image=image, instances=instances)
 
     def _patch(self, object_mask: Mask, rng: Generator) -> tuple[slice, slice] | None:
-        """Sample a patch inside the object's box; None if the box is too small."""
+        """Sample a patch's rows and columns in the mask's box; None if the box is too small."""
         slices = []
         limits = self.max_height, self.max_width
         for side, limit in zip(mask_slices(object_mask), limits, strict=True):
@@ -201,10 +207,9 @@ class RandomMask(Checked):
     def _crop(
         self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
     ) -> RGBImage | None:
-        """Return a random crop of the image's background.
+        """Return a random crop of the image's background of at most (height, width).
 
-        If no part of the background is suitable, the crop is from ``other``. The result is None if
-        the sampled crops of ``other`` have no contrast either.
+        Without such a crop, return a crop with contrast from ``other``, or None.
         """
         crop = crops.largest(size, rng)
         if crop is not None:

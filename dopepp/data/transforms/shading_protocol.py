@@ -3,10 +3,10 @@
 Random crops of the image's background cover an object inside its box, one after another, until the
 requested number of visible pixels is covered. Pixels are ordered by the time of covering; a share
 is the beginning of this order with the requested number of visible pixels. Shares are exact to
-half a pixel, and a larger share contains a smaller share. The last patch is cut.
+half a pixel, and a larger share contains a smaller share. The last patch is cut to fit.
 
-A patch is drawn behind other objects, so that only its own patches cover an object. Training uses
-:mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
+A patch lies behind the other objects, so that it covers only the object for which it is sampled.
+Training uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dopepp.drawing.pictures import Mask, RGBImage
 
 TOLERANCE: Final = 0.02  # Allowed difference of the covered share from the requested share.
 _SIDES: Final = (0.15, 0.5)
-"""Range of a patch's sides as shares of the box's: several fit, and each hides edges."""
+"""Range of a patch's sides as shares of the sides of the object's box, so several patches fit."""
 
 _MAX_PATCHES: Final = 300
 """More patches would be tiny, as the background has no room for larger crops."""
@@ -43,9 +43,9 @@ class ShadedSample:
     """An image with shaded objects.
 
     Attributes:
-        sample: The image; depth is unknown under patches.
-        reached: Covered share of each instance's visible pixels; None for an instance
-            without a mask or a visible pixel.
+        share: Share of each instance's visible pixels to cover, in [0, 1].
+        sample: The image; depth is 0 (unknown) under patches.
+        reached: Actual share; None for an instance without a mask or a visible pixel.
     """
 
     share: float
@@ -54,11 +54,11 @@ class ShadedSample:
 
 
 def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[ShadedSample]:
-    """Shade an image's objects, once for each share.
+    """Return an image's shaded copies, one for each share of the objects' pixels to cover.
 
     Args:
-        sample: The image.
-        shares: Shares of each instance's visible pixels, in [0, 1], independent of each other.
+        sample: The image with its annotated objects.
+        shares: Shares of each instance's visible pixels, in [0, 1], one for each result.
         seed: Seed of the patches.
         index: Index of the image in the test set.
 
@@ -84,14 +84,14 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
 
 
 def _can_be_shaded(instance: Instance) -> bool:
-    """Return whether an instance has visible pixels in its mask."""
+    """Return whether an instance has a mask with a visible pixel."""
     return instance.mask is not None and bool(instance.mask.any())
 
 
 def _cover_share(
     sample: Sample, silhouettes: Sequence[Mask], covers: Sequence[_Cover], share: float
 ) -> ShadedSample:
-    """Cover a share of each object with its patches, and update the instances and the depth."""
+    """Return the sample with patches on a share of each object's visible pixels."""
     image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
     for cover in covers:
         is_patch = cover.pixels_of_share(share)
@@ -108,10 +108,10 @@ def _cover_share(
 
 
 class _Cover:
-    """Patches that cover ``share`` of an instance's visible pixels.
+    """Patches on ``share`` of an instance's ``visible`` pixels, in the bounding box of these.
 
-    ``order`` numbers the pixels of the box in the order of covering; no patch covers ``protected``
-    pixels.
+    ``order`` numbers the pixels of the box in the order of covering, and ``pixels`` has the colours
+    of the patches. No patch covers ``protected`` pixels.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class _Cover:
             self._add_patch(crop, uncovered[rng.integers(len(uncovered))], rng)
 
     def pixels_of_share(self, share: float) -> Bool[np.ndarray, "rows columns"]:
-        """Return the covered pixels of the box for a share of the visible pixels."""
+        """Return which pixels of the box are covered at a share of the visible pixels."""
         num_pixels = round(share * self._num_visible)
         if num_pixels == 0:
             return np.zeros(self.order.shape, bool)
@@ -141,7 +141,7 @@ class _Cover:
         return self.order <= min(int(last), _NEVER - 1)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> RGBImage | None:
-        """Sample a crop of random size, reduced to fit the background, or None."""
+        """Sample a crop of random size, halved until the background has one, or None."""
         extent = self._visible.shape
         if min(extent) < MIN_PATCH_PX:
             return None
@@ -151,7 +151,7 @@ class _Cover:
         return crops.largest((height, width), rng)
 
     def _add_patch(self, crop: RGBImage, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
-        """Insert a crop below earlier crops, at a random position that covers ``pixel``."""
+        """Insert a crop below earlier crops, at a random place over ``pixel`` (row, column)."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
             first, last = max(0, position - length + 1), min(position, extent - length)

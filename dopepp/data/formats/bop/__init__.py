@@ -57,8 +57,8 @@ class BopPoses:
     Attributes:
         obj_ids: BOP's object numbers; −1 if damaged.
         T_cam_obj: Rigid transforms, metres; NaN if damaged.
-        visible_fractions: Stated fractions; NaN if missing.
-        inexact: Whether the nearest rotation replaces the stated matrix (``INEXACT``).
+        visible_fractions: Annotated ``visib_fract``; NaN if missing.
+        inexact: Whether the nearest rotation replaces the annotated matrix (``INEXACT``).
     """
 
     obj_ids: Int[np.ndarray, " objects"]
@@ -67,11 +67,11 @@ class BopPoses:
     inexact: Bool[np.ndarray, " objects"]
 
     def select(self, is_selected: Bool[np.ndarray, " objects"]) -> BopPoses:
-        """Return the selected objects."""
+        """Return the objects for which ``is_selected`` is True."""
         return BopPoses(*(values[is_selected] for values in vars(self).values()))
 
     def without_model(self, models: Collection[int]) -> Counter[int]:
-        """Count the objects outside ``models`` by number; none if ``models`` is empty."""
+        """Count the objects whose number is not in ``models``; count none if that is empty."""
         ids = self.obj_ids[self.obj_ids >= 0].tolist()
         return Counter(number for number in ids if models and number not in models)
 
@@ -107,7 +107,7 @@ def pair_infos(truths: Sequence[Record], entry: object, node: Node) -> list[Reco
 
 
 def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: Nodes) -> BopPoses:
-    """Return the objects of ``gt`` and ``gt_info`` records.
+    """Return the objects of ``gt`` and ``gt_info`` records; report wrong values and make them NaN.
 
     Args:
         truths: Records with ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
@@ -152,7 +152,7 @@ def _optional_column(
 def _column(
     records: Sequence[object], field: str, count: int, node: Callable[[int], Node]
 ) -> Float[np.ndarray, "records count"]:
-    """Convert a field of all records at once, or record by record to report wrong records."""
+    """Return ``count`` numbers in a field of each record; report wrong fields and make them NaN."""
     if not records:
         return np.empty((0, count))
     try:
@@ -176,12 +176,12 @@ def _orthogonality(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " 
 
 
 def is_number(text: str) -> bool:
-    """Return whether a key or a name is the number of an image, an object or a scene."""
+    """Return whether a text is a number of an image, object or scene: 1 to 9 ASCII digits."""
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
 class SceneRecords(NamedTuple):
-    """The content of a scene's JSON files, by image; each truth has an info, or None."""
+    """Records of a scene's JSON files by image; ``infos`` has an entry for each truth, or None."""
 
     cameras: Mapping[int, object]
     truths: Mapping[int, list[Record]]
@@ -225,7 +225,7 @@ def image_files(
     Args:
         scene: Folder of the scene.
         kind: :data:`IMAGES` or :data:`DEPTHS`, the allowed folders and suffixes.
-        problems: Receiver of an image that is present twice.
+        problems: Receiver of the problem that an image is present twice.
     """
     folders, suffixes = kind
     folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
@@ -244,7 +244,7 @@ def image_files(
 
 @dataclass(frozen=True)
 class BopScene:
-    """A scene's images, in the order of their numbers.
+    """Images of a scene and their requested objects, in the order of the images' numbers.
 
     Attributes:
         files: Paths of the colour images relative to ``folder``; empty for a missing file.
@@ -252,7 +252,7 @@ class BopScene:
         depth_scales: Millimetres per unit of the depth images; NaN where not stated.
         first: Image i has the objects ``first[i] … first[i + 1] − 1``.
         gt_ids: Each object's index in its image's list, which names its masks.
-        num_other: Number of objects with a model that were not requested.
+        num_other: Number of objects with a model that are omitted, as they were not requested.
         without_model: Counts of objects without a model, by object number.
         num_behind: Number of requested objects behind the camera, which are omitted.
     """
@@ -271,7 +271,7 @@ class BopScene:
     num_behind: int
 
     def objects(self, row: int) -> slice:
-        """Return the slice of the objects on an image."""
+        """Return the slice of the objects on image ``row``."""
         return slice(int(self.first[row]), int(self.first[row + 1]))
 
 
@@ -279,7 +279,7 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
 
     Args:
-        folder: The scene.
+        folder: Folder of the scene.
         wanted: Numbers of the objects to keep.
         with_model: Numbers of the objects with a model; empty in a data set without models.
     """

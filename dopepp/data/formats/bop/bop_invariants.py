@@ -40,7 +40,7 @@ FRACTION_TOLERANCE: Final = 0.05
 """Allowed difference of ``visib_fract`` from the quotient of the pixel counts."""
 
 PIXEL_TOLERANCE: Final = 0.01
-"""Allowed difference of a stated count from a mask's pixels, as a share (plus a border row)."""
+"""Allowed difference of ``px_count_visib`` from a mask's pixels, a share (plus a border row)."""
 
 BOX_EDGE_PX: Final = 2.0
 """Allowed distance of ``bbox_visib`` from the mask's box: some tools exclude the last pixel."""
@@ -68,7 +68,7 @@ def scene_folders(root: Path) -> Iterator[Path]:
 
 
 def _is_scene(folder: Path) -> bool:
-    """Return whether a folder is a BOP scene, judged by its name and files."""
+    """Return whether a folder has a scene's JSON file, or a number as name and a folder ``rgb``."""
     named = folder.name.isdecimal() and (folder / "rgb").is_dir()
     return named or any((folder / name).is_file() for name in (_CAMERA, _TRUTH, _INFO))
 
@@ -84,7 +84,7 @@ def check_bop(report: CheckReport) -> None:
 
 
 class _SceneCheck:
-    """Checks the JSON files of a scene and the files in its folders."""
+    """Check of a scene's JSON files and of its images and masks."""
 
     def __init__(self, report: CheckReport, folder: Path, models: ModelSizes | None) -> None:
         self._report, self._folder, self._models = report, folder, models
@@ -94,7 +94,7 @@ class _SceneCheck:
         self._has_truth = (folder / _TRUTH).is_file()
 
     def _image_files(self, kind: tuple[tuple[str, ...], tuple[str, ...]]) -> dict[int, Path]:
-        """Return numbered images; report images with other names."""
+        """Return colour or depth images by number; report images without a number as name."""
         files = bop.image_files(self._folder, kind, self._report)
         for folder in {path.parent for path in files.values()}:
             for path in sorted(folder.glob("[!.]*")):
@@ -103,7 +103,6 @@ class _SceneCheck:
         return files
 
     def check(self) -> None:
-        """Check all images of the scene."""
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
         if not self._has_truth:
             if (folder / _INFO).is_file() or any(self._masks.values()):
@@ -127,7 +126,6 @@ class _SceneCheck:
             report.note(f"{folder}: {staged} images written and not yet finalized")
 
     def _check_image(self, image: int) -> BopPoses:
-        """Check the files and annotations of an image; return its poses."""
         report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
         path = self._images.get(image, folder / "rgb" / f"{image:06d}.png")
         shape = image_shape(Node(report, path), modes=COLOUR_MODES)
@@ -175,7 +173,7 @@ def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
 
 @dataclass
 class Deviations:
-    """Counts of deviations that every reader handles: notes, not defects."""
+    """Counts of deviations that every reader handles, so they are notes and not defects."""
 
     inexact: int = 0
     without_fraction: int = 0
@@ -188,7 +186,7 @@ class Deviations:
         self.without_model += poses.without_model(models or ())
 
     def note(self, report: CheckReport, where: Path | str) -> None:
-        """Note the deviations and how a reader handles them."""
+        """Add a note to the report for each deviation and how readers handle it."""
         if self.inexact:
             message = f"{self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
             report.note(f"{where}: {message}; readers use the nearest rotation")
@@ -202,7 +200,7 @@ class Deviations:
 
 @dataclass(frozen=True)
 class ModelSize:
-    """An object's size in metres; None for a missing or damaged field."""
+    """Diameter and box corners (mesh frame), metres; None for a missing or damaged field."""
 
     diameter: float | None = None
     corners: Float[np.ndarray, "8 3"] | None = None
@@ -242,7 +240,7 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> ModelSizes | None
 
 
 def _model(node: Node, record: object, stated: float) -> ModelSize:
-    """Check the diameter and the bounding box in a record of ``models_info.json``."""
+    """Check diameter and box in a record of ``models_info.json``; return the plausible values."""
     fields, diameter = mapping(record), None if np.isnan(stated) else stated
     if fields and "diameter" not in fields:
         node["diameter"].report("missing")
@@ -324,7 +322,7 @@ def _check_camera(
 def _check_counts(
     node: Node, info: Mapping[str, Any], visible: Mask | None, fraction: float | None
 ) -> None:
-    """Compare pixel counts with each other, the visible fraction and the mask."""
+    """Report pixel counts that contradict each other, the visible fraction or the mask."""
     total, count = (
         node[field].scalar(info[field]) if field in info else np.nan
         for field in ("px_count_all", "px_count_visib")
@@ -343,7 +341,7 @@ def _check_counts(
 
 
 def _check_boxes(node: Node, info: Mapping[str, Any], mask_box: Box | None) -> Box | None:
-    """Compare ``bbox_visib`` with the mask's box; return the mask's box, or else the stated box."""
+    """Report a ``bbox_visib`` off the mask's box; return the mask's box, or else ``bbox_visib``."""
     boxes: dict[str, Box] = {}
     for field_name in ("bbox_visib", "bbox_obj"):
         if field_name in info:

@@ -52,7 +52,7 @@ _DIAMETER_TOLERANCE: Final = 0.01
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """One object of ``models_info.json``; the diameter is in metres, NaN if not stated."""
+    """An entry of ``models_info.json``; the diameter is in metres, NaN if not stated."""
 
     name: str
     path: Path
@@ -156,7 +156,7 @@ def read_models(root: Path) -> dict[int, ModelInfo]:
 
 
 def objects_with_model(infos: Mapping[int, ModelInfo]) -> set[int]:
-    """Return the objects with a model file, or all objects if none has a file."""
+    """Return the numbers of objects with a model file, or of all objects if none has a file."""
     with_file = {number for number, info in infos.items() if info.path.is_file()}
     return with_file or set(infos)
 
@@ -168,7 +168,7 @@ def info_path(root: Path) -> Path | None:
 
 
 def parse_models(path: Path, records: object, problems: Problems = STRICT) -> dict[int, ModelInfo]:
-    """Return the objects in the content of a ``models_info.json``, by number."""
+    """Return the objects in ``records``, the content of the ``models_info.json`` at ``path``."""
     node = Node(problems, path)
     if not isinstance(records, dict):
         node["top level"].report(f"{records!r:.60}", _ALLOWED)
@@ -187,7 +187,7 @@ def parse_models(path: Path, records: object, problems: Problems = STRICT) -> di
 
 
 def _info(node: Node, model: Path, record: object) -> ModelInfo:
-    """Read a model's record in ``models_info.json``."""
+    """Parse an object's record in ``models_info.json``; ``model`` is the path of its mesh."""
     if not isinstance(record, dict):
         node.report(f"{record!r:.60}", "an object with diameter and symmetries")
     fields, diameter = mapping(record), math.nan
@@ -201,7 +201,6 @@ def _info(node: Node, model: Path, record: object) -> ModelInfo:
 
 
 def _symmetries(node: Node, fields: Mapping[str, Any]) -> Symmetries:
-    """Read the discrete and continuous symmetries of a model's record."""
     readers = zip(SYMMETRY_FIELDS, (_discrete, _continuous), strict=True)
     return {name: read(node[name], fields.get(name)) for name, read in readers}
 
@@ -219,7 +218,7 @@ def parse_symmetries(name: str, fields: object) -> Symmetries:
 
 
 def _discrete(node: Node, value: object) -> Float[np.ndarray, "symmetries 4 4"] | None:
-    """Read discrete symmetries without the identity; report invalid transforms."""
+    """Parse discrete symmetries into metres, without the identity; report invalid transforms."""
     transforms = []
     for number, row in enumerate(_rows(node, value)):
         matrix = node[number].numbers(row, 4, 4)
@@ -241,7 +240,7 @@ def _discrete(node: Node, value: object) -> Float[np.ndarray, "symmetries 4 4"] 
 def _continuous(
     node: Node, value: object
 ) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
-    """Read continuous symmetries as pairs of axis and offset, metres."""
+    """Parse continuous symmetries into pairs of axis and offset, metres."""
     pairs = []
     for number, row in enumerate(node.entries(_rows(node, value))):
         entry = node[number]
@@ -253,7 +252,7 @@ def _continuous(
 
 
 def _rows(node: Node, value: object) -> list[Any]:
-    """Return a list of symmetries; report any other value and return an empty list."""
+    """Return a list of symmetries; report any other value and a too long list, and return []."""
     if value is None or (isinstance(value, list) and len(value) <= MAX_SYMMETRIES):
         return value or []
     node.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
@@ -292,7 +291,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
 
 
 def model_info(part: Part) -> dict[str, object]:
-    """Return a part's entry of ``models_info.json``: millimetres, transforms row by row."""
+    """Return a part's entry of ``models_info.json``: lengths in mm, transforms row by row."""
     lower = part.cuboid[:8].min(axis=0) * MM
     size = part.cuboid[:8].max(axis=0) * MM - lower
     record: dict[str, object] = {"name": part.name, "diameter": part.diameter * MM}
@@ -311,7 +310,7 @@ def model_info(part: Part) -> dict[str, object]:
 
 
 def ply_bytes(mesh: Mesh, texture_name: str) -> bytes:
-    """Encode a mesh as binary PLY that names its texture's file, if it has a texture."""
+    """Encode a mesh as binary PLY, millimetres, that names its texture's file, if any."""
     import trimesh  # slow to import, and only needed for writing
 
     # Weighted by the faces' angles at the vertex, like BOP's normals (Thürmer, Wüthrich 1998).

@@ -73,7 +73,7 @@ def read_targets(path: Path) -> Targets:
 
 
 class BopReader:
-    """The images of a split, by scene and number.
+    """Reader of the images of a split, ordered by scene and image number.
 
     The constructor reads the scenes' JSON files and checks every record; images are read singly. An
     image without ground truth has no instances. The reader ignores and counts objects that are not
@@ -115,7 +115,7 @@ class BopReader:
         self._log_deviations(with_model)
 
     def _find_items(self) -> list[tuple[BopScene, int]]:
-        """Return scene and row of each selected image on disk, in order."""
+        """Return the scene and row in it of each selected image on disk, in order."""
         listed = [
             (scene, row)
             for scene in self._scenes
@@ -135,7 +135,6 @@ class BopReader:
         return present
 
     def _log_deviations(self, with_model: Collection[int]) -> None:
-        """Log the ignored objects and the estimated or replaced values."""
         other = sum(scene.num_other for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)
         without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
@@ -164,7 +163,7 @@ class BopReader:
             _log.warning("%s: %s %s", self.name, f"{lacking:,}", problem)
 
     def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
-        """Return the number of instances to find of each object on an image; None for all."""
+        """Return the numbers of instances to find on an image by object number; None for all."""
         assert self._targets is not None
         return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
 
@@ -173,7 +172,7 @@ class BopReader:
 
     @cached_property
     def image_ids(self) -> list[tuple[str, int]]:
-        """Folder of the scene and number of each image."""
+        """Name of the scene's folder and number of each image."""
         return [(scene.folder.name, int(scene.image_ids[row])) for scene, row in self._items]
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
@@ -207,7 +206,7 @@ class BopReader:
         return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
     def _depth(self, scene: BopScene, row: int, shape: Shape) -> DepthMap | None:
-        """Read the depth image; None in a scene without depth images."""
+        """Read an image's depth in metres; None in a scene without depth images."""
         if not any(scene.depth_files):
             return None
         expected = f"depth/{scene.image_ids[row]:06d}.png"
@@ -231,11 +230,11 @@ class BopReader:
         return first.size, first.K, (floor(100 * min(depths)) / 100, ceil(100 * max(depths)) / 100)
 
     def contains(self, label: str) -> bool:
-        """Return whether any image shows this object."""
+        """Return whether the object is annotated on any selected image."""
         return bool(self._num_instances.get(label))
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the images by hashes of annotation and objects, and the fractions' origin."""
+        """Return one entry: hashes of annotations and meshes, and the visible fractions' origin."""
         digest = hashlib.sha256()
         unknown = 0
         for scene, row in self._items:
@@ -254,7 +253,7 @@ class BopReader:
 
     @cached_property
     def _num_instances(self) -> dict[str, int]:
-        """Count the instances of each part on the selected images."""
+        """Numbers of instances on the selected images by part name."""
         counts: Counter[int] = Counter()
         for scene, row in self._items:
             counts.update(scene.poses.obj_ids[scene.objects(row)].tolist())

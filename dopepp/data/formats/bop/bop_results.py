@@ -39,7 +39,7 @@ _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
 _COUNTS: Final = {"score": 1, "R": 9, "t": 3, "time": 1}
 
 Table = Float[np.ndarray, "rows 18"]
-"""A line's number and its 17 numbers."""
+"""Per pose, the number of its line in the file and the line's 17 numbers."""
 
 _ID: Final = re.compile(r"\d{1,9}", re.ASCII)
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -47,7 +47,7 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True)
 class BopResult:
-    """An estimated pose; ``seconds`` is the time for the whole image, −1 if unknown."""
+    """An estimated pose, metres; ``seconds`` is the time for the whole image, −1 if unknown."""
 
     scene_id: int
     im_id: int
@@ -106,7 +106,7 @@ def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the lines with poses and their numbers."""
+    """Yield the number and text of each line with a pose."""
     allowed = f"a CSV file of {','.join(FIELDS)}"
     if not path.is_file():
         raise _error(f"{path}, no such file", allowed, "pass the path of an existing file")
@@ -148,7 +148,7 @@ def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
 
 
 def _numbers(name: str, field: str, where: str) -> list[float]:
-    """Return the numbers of a field after checking their count and values."""
+    """Return the numbers of a field, or raise a UserError for a wrong count or value."""
     words, count = field.split(), _COUNTS[name]
     if len(words) != count:
         noun = "number" if count == 1 else "numbers between spaces"
@@ -171,7 +171,7 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
 
 
 def _check_repeats(path: Path, table: Table) -> None:
-    """Reject lines that differ only in the time."""
+    """Raise a UserError if two lines differ only in the time."""
     keys = table[:, 1:17]
     order = np.lexsort(keys.T[::-1])  # stable: equal rows keep the order of lines
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
@@ -183,7 +183,7 @@ def _check_repeats(path: Path, table: Table) -> None:
 
 
 def _check_unit(path: Path, table: Table) -> None:
-    """Check that the median distance is plausible in millimetres."""
+    """Raise a UserError if the median distance is not plausible in millimetres."""
     if not len(table):
         return
     distances = np.linalg.norm(table[:, 14:17], axis=1)
@@ -201,5 +201,4 @@ def _check_unit(path: Path, table: Table) -> None:
 def _error(
     problem: str, allowed: str, fix: str = "correct the line, or write the file again"
 ) -> UserError:
-    """Return the error for a malformed results file."""
     return UserError(problem, allowed, fix)

@@ -54,7 +54,7 @@ Record = dict[str, Any]
 
 
 class BopFolder:
-    """A folder of models, numbered by :func:`model_numbers`, and a split of images."""
+    """Base of writers of a BOP data set: models, numbered by :func:`model_numbers`, and a split."""
 
     chunk_size = IMAGES_A_SCENE
 
@@ -62,7 +62,7 @@ class BopFolder:
         self.root, self.split, self._parts = Path(root), split, tuple(parts)
 
     def prepare(self) -> None:
-        """Write the models.
+        """Write the parts' models, if they are not there yet.
 
         Raises:
             UserError: The split has images, and the models are missing or of other parts.
@@ -80,7 +80,7 @@ class BopFolder:
         return {part.name: (part, make_surface(part.mesh)) for part in self._parts if part.mesh}
 
     def labels(self, sample: Sample) -> Labels:
-        """Annotate a sample, see :func:`make_labels`."""
+        """Return a sample's annotation, see :func:`make_labels`."""
         numbers = model_numbers([part.name for part in self._parts])
         return make_labels(sample, numbers, self._surfaces)
 
@@ -91,7 +91,7 @@ class BopWriter(BopFolder):
     name = "bop"
 
     def write(self, index: int, sample: Sample) -> None:
-        """Write an image's files, its records last."""
+        """Write an image's files, last the staged records, which mark it as complete."""
         labels = self.labels(sample)
         chunk, image = divmod(index, self.chunk_size)
         scene = self._scene(chunk)
@@ -105,7 +105,7 @@ class BopWriter(BopFolder):
         stage_item(scene / STAGING / f"{image:06d}.json", json.dumps(item).encode())
 
     def written(self, chunk: int) -> set[int]:
-        """Return the indices of the scene's complete images."""
+        """Return the indices of the scene's images that are staged or finalized."""
         scene = self._scene(chunk)
         images = {int(path.stem) for path in _staged_files(scene)}
         cameras = read_object(scene / "scene_camera.json", MAX_SCENE_BYTES)
@@ -113,7 +113,7 @@ class BopWriter(BopFolder):
         return {chunk * self.chunk_size + image for image in images}
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
-        """Merge the staged records into the scene's files, and the first camera into the root's."""
+        """Merge staged records into the scene's files, and write the data set's ``camera.json``."""
         scene = self._scene(chunk)
         image_numbers = {index % self.chunk_size for index in indices}
         with lock_staging(scene / STAGING):
@@ -134,11 +134,10 @@ class BopWriter(BopFolder):
                 path.unlink()
 
     def _scene(self, chunk: int) -> Path:
-        """Return the folder of the scene that a chunk is written to."""
         return self.root / self.split / f"{chunk:06d}"
 
     def _write_camera(self, chunk: int, image: int, camera: Mapping[str, Any]) -> None:
-        """Write ``camera.json``, which describes the sensor, from the first image."""
+        """Write ``camera.json`` from an image's camera, if no earlier scene is on the disk."""
         folders = (self.root / self.split).iterdir()
         if chunk > min(int(path.name) for path in folders if path.name.isdecimal()):
             return
@@ -151,7 +150,6 @@ class BopWriter(BopFolder):
 
 
 def _staged_files(scene: Path) -> list[Path]:
-    """Return the staged records of images, which are not in the scene's JSON files yet."""
     return staged_items(scene / STAGING, ".json")
 
 
@@ -161,7 +159,10 @@ class Labels:
 
     Attributes:
         camera: ``cam_K``, ``depth_scale`` and, in a static scene, the pose of the world.
+        truths: ``scene_gt`` records of the objects.
+        infos: ``scene_gt_info`` records of the objects.
         depth: Units of ``depth_scale`` mm, 0 where unknown.
+        masks: Silhouettes of the objects without occlusion.
     """
 
     camera: Record
@@ -175,7 +176,7 @@ class Labels:
 def make_labels(
     sample: Sample, object_ids: Mapping[str, int], parts: Mapping[str, tuple[Part, Surface]]
 ) -> Labels:
-    """Annotate a sample as BOP's toolkit does.
+    """Return a sample's annotation as BOP's toolkit defines it.
 
     A box is (x, y, width, height). Width and height are differences between the coordinates of the
     outermost pixels, so that a single pixel has width 0. The box of an object without a visible
@@ -210,7 +211,7 @@ def make_labels(
 def _info(
     instance: Instance, visible: Mask, whole: Silhouette, depth: UInt16[np.ndarray, "height width"]
 ) -> Record:
-    """Return an instance's record in ``scene_gt_info.json``."""
+    """Return an instance's ``scene_gt_info`` record; ``whole`` is its unoccluded silhouette."""
     visible_box = Box.of_mask(visible)
     return {
         "bbox_obj": _bop_box(None if visible_box is None else _silhouette_box(whole)),
@@ -224,7 +225,7 @@ def _info(
 
 
 def _bop_box(box: Box | None) -> list[int]:
-    """Return BOP's (x, y, width, height); −1 without a box."""
+    """Return BOP's (x, y, width, height) in pixels; four times −1 without a box."""
     if box is None:
         return [-1] * 4
     return [int(n) for n in (box.left, box.top, box.right - box.left, box.bottom - box.top)]

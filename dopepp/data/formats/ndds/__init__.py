@@ -40,17 +40,18 @@ _NORM_TOLERANCE: Final = 0.1
 """Allowed deviation of a quaternion's norm from 1."""
 
 Objects = list[tuple[Node, Mapping[str, Any], str]]
-"""(node, object, class) of every object of an annotation."""
+"""(node, JSON object, class name) of every object of an annotation."""
 
 
 @dataclass(frozen=True)
 class NddsObject:
-    """An object as annotated, in unknown units and orders; NaN for damaged numbers.
+    """An annotated object, in the file's unknown units and orders; NaN for damaged numbers.
 
     Attributes:
+        location: Position of the object frame's origin in the camera frame.
         quaternion: The four numbers of ``quaternion_xyzw`` in the order of the file.
         corners_px: ``projected_cuboid`` without its centroid, if stated.
-        cuboid: Corners in space, in the order of ``corners_px``, if stated.
+        cuboid: Corners in the camera frame, in the order of ``corners_px``, if stated.
         centroid: ``cuboid_centroid``, or else the mean of ``cuboid``; None without both.
         visibility: In [0, 1], or −1 for unknown, if stated.
     """
@@ -66,7 +67,7 @@ class NddsObject:
 
 
 def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | None:
-    """Read an annotation or a settings file; None if the file is damaged."""
+    """Read an annotation or a settings file; report a damaged file and return None."""
     return Node(problems, path).load(max_bytes=MAX_ITEM_BYTES)
 
 
@@ -83,7 +84,7 @@ def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRIC
 
 
 def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
-    """Parse one object, and report a missing location or quaternion."""
+    """Parse an annotated object; report wrong fields and replace them by NaN or None."""
 
     def numbers(name: str, *shape: int) -> NDArray[np.float64]:
         return node[name].numbers(item.get(name), *shape)
@@ -112,12 +113,12 @@ def parse_object(item: Mapping[str, Any], node: Node) -> NddsObject:
 
 
 def convention_entry(record: Mapping[str, Any], name: str) -> object:
-    """Return an entry of the ``conventions`` that our writer adds to annotations, or None."""
+    """Return an entry of the ``conventions`` that ``NddsWriter`` adds to annotations, or None."""
     return mapping(record.get("conventions")).get(name)
 
 
 def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the annotations with an image, and the annotations without an image, sorted.
+    """Return the paths of annotations with an image, and of those without an image, sorted.
 
     The search skips settings (``_*.json``) and hidden files.
     """
@@ -146,7 +147,7 @@ def image_path(annotation: Path) -> Path | None:
 
 
 class NddsSettings:
-    """The settings files of a data set, each read once on first use."""
+    """Settings files of a data set, each read once on first use."""
 
     def __init__(self, root: Path, problems: Problems = STRICT) -> None:
         self._root, self._problems = root, problems
@@ -159,7 +160,7 @@ class NddsSettings:
         return self._files[path]
 
     def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
-        """Return path and content of the settings in the annotation's folder or the data set's."""
+        """Return path and content of settings in the annotation's folder, or else in the root."""
         for path in (annotation.with_name(name), self._root / name):
             content = self.read(path)
             if content is not None:
@@ -169,7 +170,7 @@ class NddsSettings:
     def camera(
         self, record: Mapping[str, Any], annotation: Path, problems: Problems = STRICT
     ) -> CameraMatrix:
-        """Return K from the annotation's ``camera_data.intrinsics`` or the camera settings.
+        """Return K (pixels) from an annotation's ``camera_data.intrinsics`` or the camera settings.
 
         If the settings have several cameras, the end of the stem names the camera (FAT's ``left``
         and ``right``). If no camera or several cameras match, the problem is reported and K is NaN.
@@ -214,7 +215,7 @@ class NddsSettings:
         return None
 
     def dimensions(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
-        """Return a class's usable ``cuboid_dimensions`` (x, y, z) in the file's unit, or None."""
+        """Return a class's ``cuboid_dimensions`` (x, y, z) in the file's unit; None if unusable."""
         for sides in self._arrays(annotation, label, "cuboid_dimensions", 3):
             if np.isfinite(sides).all() and (sides >= 0).all() and sides.any():
                 return sides
@@ -238,7 +239,7 @@ class NddsSettings:
     def _arrays(
         self, annotation: Path, label: str, name: str, *shape: int
     ) -> Iterator[NDArray[np.float64]]:
-        """Yield a field of a class's entries if its numbers have the shape."""
+        """Yield a field of each of a class's entries in which its numbers have the shape."""
         for entry in self._objects(annotation, label):
             with suppress(KeyError, TypeError, ValueError, OverflowError):
                 yield np.array(entry[name], np.float64).reshape(shape)
@@ -256,7 +257,7 @@ def _intrinsics(values: Mapping[str, Any], node: Node) -> CameraMatrix:
 
 
 def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
-    """Read depth in metres along z; None without a depth image of known unit.
+    """Read an item's depth image in metres along z; None without a depth image of known unit.
 
     Args:
         record: The annotation, which may state the unit.
@@ -304,5 +305,5 @@ def label_values(
 
 
 def has_object_ids(record: Mapping[str, Any]) -> bool:
-    """Return whether an annotation states that ``.seg.png`` labels objects, not classes."""
+    """Return whether an annotation states that pixels of ``.seg.png`` are ids of objects."""
     return convention_entry(record, "segmentation") == "segmentation_id"

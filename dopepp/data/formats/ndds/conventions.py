@@ -53,7 +53,7 @@ OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention of unit, axes and rotation in which a file states poses (default: NDDS)."""
+    """Units, axes and frame in which a file states its poses (default: as NDDS documents)."""
 
     quaternion: Quaternion = "xyzw"
     unit: Unit = "cm"
@@ -74,14 +74,14 @@ POSE_CONVENTIONS: Final = tuple(
     for unit in METRES
     for quaternion in get_args(Quaternion)
 )
-"""All combinations, documented conventions first; the first of equally good fits is chosen."""
+"""All combinations, defaults first; the first of equally good fits is chosen."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """An annotated object of a known part, for testing conventions.
+    """An annotated object of a known part, whose reprojection tests conventions.
 
-    ``fixed`` is the class's rigid ``fixed_model_transform``, with a translation in the file's unit.
+    ``fixed`` is :meth:`~dopepp.data.formats.ndds.NddsSettings.fixed_transform` of the class.
     """
 
     item: NddsObject
@@ -107,14 +107,14 @@ class Observation:
         return make_transform(axes @ rotation, axes @ location)
 
     def predicted_px(self, convention: PoseConvention) -> Float[np.ndarray, "8 2"] | None:
-        """Project the file's corners under a convention; NaN behind the camera."""
+        """Project the part's corners, in the file's order, at this pose; NaN behind the camera."""
         T_cam_obj = self.T_cam_obj(convention)
         if T_cam_obj is None:
             return None
         return project(transform(T_cam_obj, self._corners[convention.frame]), self.K)
 
     def error_px(self, convention: PoseConvention) -> float:
-        """Return the median distance from ``projected_cuboid``; infinite behind the camera."""
+        """Return the corners' median distance from ``projected_cuboid``; inf behind the camera."""
         predicted = self.predicted_px(convention)
         if predicted is None or self.item.corners_px is None:
             return np.inf
@@ -123,7 +123,7 @@ class Observation:
 
     @cached_property
     def _corners(self) -> dict[Frame, NDArray[np.float64]]:
-        """Corners in the mesh frame by object frame, in the file's order, metres."""
+        """The part's corners by convention of the frame: mesh frame, the file's order, metres."""
         part_corners, front = self.part.cuboid[:8], _rotated_corners(self.part, _FRONT_X)
         rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
         fixed = _rotated_corners(self.part, rotation)
@@ -133,7 +133,7 @@ class Observation:
 
 
 def _rotated_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
-    """Return the corners of the part's box along rotated axes, in NDDS order, part frame."""
+    """Return the corners of the part's box along rotated axes: NDDS order, mesh frame, metres."""
     # For rotations other than by right angles, the box of the rotated cuboid is too large.
     quarter_turns = np.abs(np.abs(rotation).max(axis=0) - 1).max() < 1e-6
     shape = part.points if part.mesh is None else part.mesh.vertices
@@ -142,16 +142,16 @@ def _rotated_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, 
 
 
 MAX_ERROR_PX: Final = 5.0
-"""Largest error of most instances under the correct convention, sufficient for real photos."""
+"""Allowed reprojection error of the instances that fit (``_MIN_FITTING``), even on photos."""
 
 _MAX_SHARE: Final = 0.05
-"""Allowed error of an instance as a share of its projected cuboid's longer side."""
+"""Allowed reprojection error of an instance as a share of its cuboid's longer side."""
 
 _MIN_FITTING: Final = 0.75
 """Share of the instances that must fit; the others may be damaged."""
 
 _MIN_RATIO: Final = 3.0
-"""Factor by which any convention with other poses must fit worse."""
+"""Factor by which the error of any convention with other poses must be larger."""
 
 _ROUNDING_PX: Final = 0.05  # error difference of equally good fits, due to rounding in files
 _SAME_POSE: Final = 0.05  # largest corner distance between equal poses, diameters
@@ -159,12 +159,12 @@ _SAME_POSE: Final = 0.05  # largest corner distance between equal poses, diamete
 
 @dataclass(frozen=True)
 class NddsFinding:
-    """The convention of a data set with its evidence.
+    """The pose convention of a data set, with the reprojection errors that determine it.
 
     Attributes:
-        error_px: Largest error of three quarters of the instances.
-        rival_px: The same error under the best convention with different poses.
-        undecided: Conventions that give equal poses on these instances.
+        error_px: Upper quartile of the instances' errors (:meth:`Observation.error_px`).
+        rival_px: This quartile under the best convention with different poses.
+        undecided: Other conventions that give equal poses on these instances.
     """
 
     convention: PoseConvention
@@ -186,7 +186,7 @@ class NddsFinding:
 def find_convention(observations: Sequence[Observation], where: str) -> NddsFinding:
     """Find the only convention under which the parts' cuboids project to ``projected_cuboid``.
 
-    One observation is enough in most cases.
+    One observation is enough in most cases. Messages name the data set ``where``.
 
     Raises:
         UserError: No convention fits three quarters of the instances within 5 px, or two
@@ -212,7 +212,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
 
 
 def check_observation(observation: Observation, convention: PoseConvention) -> Transform:
-    """Return an instance's pose after a comparison with its ``projected_cuboid``.
+    """Return an instance's pose (metres), checked by reprojection to its ``projected_cuboid``.
 
     Raises:
         UserError: The instance is behind the camera, lacks a ``fixed_model_transform``, or is off
@@ -239,7 +239,7 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
 
 
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
-    """Return whether two conventions give most instances the same pose."""
+    """Return whether two conventions give three quarters of the instances nearly the same pose."""
     distances = []
     for observation in observations:
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part
@@ -251,7 +251,7 @@ def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseC
 
 
 def _quantile(values: Sequence[float]) -> float:
-    """Return the upper bound of three quarters of the values, which is robust to damaged items."""
+    """Return the upper quartile of the values, which is robust to damaged items."""
     return float(np.quantile(values, _MIN_FITTING, method="higher"))
 
 

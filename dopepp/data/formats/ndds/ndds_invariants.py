@@ -29,7 +29,7 @@ _DERIVED: Final = (".depth", ".seg", ".cs", ".is", ".16", ".8")
 
 
 def check_ndds(report: CheckReport) -> None:
-    """Check every annotation, every image and the settings."""
+    """Check every annotation, image and settings file of a data set."""
     items, without_image = ndds.find_items(report.root)
     _check_unannotated(report, items + without_image)
     for path in without_image:
@@ -50,7 +50,7 @@ def check_ndds(report: CheckReport) -> None:
 
 
 def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -> None:
-    """Check the settings files for missing and repeated names."""
+    """Report exported classes without an entry and repeated camera names in a folder's settings."""
     content = settings.read(folder / ndds.OBJECT_SETTINGS) or {}
     listed = content.get("exported_object_classes")
     node = Node(report, folder / ndds.OBJECT_SETTINGS, "exported_objects")
@@ -68,7 +68,6 @@ def _check_settings(report: CheckReport, settings: NddsSettings, folder: Path) -
 
 
 def _repeated(values: Iterable[Hashable]) -> list[Hashable]:
-    """Return the values that occur more than once."""
     return [value for value, number in Counter(values).items() if number > 1]
 
 
@@ -90,7 +89,7 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
 def _check_item(
     report: CheckReport, path: Path, settings: NddsSettings, majority: Majority, maps: list[str]
 ) -> None:
-    """Check an annotation, its image and the required ``maps``, given by suffix."""
+    """Check an annotation at ``path``, its image and the required ``maps``, given by suffix."""
     image = ndds.image_path(path)
     shape = None if image is None else image_shape(Node(report, image))
     images = {
@@ -134,7 +133,7 @@ def _check_camera(
 
 
 def _check_ids(node: Node, objects: Objects) -> set[int]:
-    """Report ids shared by two objects; return the segmentation ids."""
+    """Report ids shared by two objects of an annotation; return the set of ``segmentation_id``."""
     for name in ("instance_id", "segmentation_id"):
         stated = [item.get(name) for _, item, _ in objects]
         ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none

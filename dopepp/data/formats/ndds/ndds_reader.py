@@ -37,7 +37,7 @@ _MAX_COUNTED_ITEMS: Final = 1000
 
 
 class NddsReader:
-    """The items of an NDDS or FAT folder and of the folders below it.
+    """Reader of the items in an NDDS or FAT folder and in the folders below it.
 
     Most files state a ``visibility`` that ignores the image's border: 1 or 0 for visible or not, or
     the visible share of the silhouette. The reader then multiplies it by the share of the projected
@@ -51,7 +51,7 @@ class NddsReader:
     Args:
         parts: Objects to return. An instance's ``class`` is a part's name, FAT's form of that name
             (``NAME_16k``), or a key of ``classes``.
-        part_of: First and last share of the sorted items to use, e.g. (0, 0.9) and (0.9, 1).
+        part_of: Share of the sorted items to use as (first, last) fractions, e.g. (0, 0.9).
         classes: Names of parts by class names in the files.
 
     Raises:
@@ -107,7 +107,7 @@ class NddsReader:
         return conventions.find_convention(visible or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
-        """Return the part of a class name, after removing FAT's suffix if necessary."""
+        """Return the part of a class name in the files, or None; see the class for the rules."""
         label = self._classes.get(label, label)
         if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
             label = label[: -len(_FAT_SUFFIX)]
@@ -155,7 +155,7 @@ class NddsReader:
         return Sample(image, K, instances, depth, self.name, self._key(path))
 
     def _key(self, path: Path) -> str:
-        """Return an annotation's path below the data set, without suffix."""
+        """Return an annotation's path relative to the data set's folder, without suffix."""
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
     def _is_out_of_view(self, observation: Observation) -> bool:
@@ -168,7 +168,7 @@ class NddsReader:
     def _instance(
         self, observation: Observation, shape: Shape, counts_truncation: bool
     ) -> Instance:
-        """Return the instance of an observation, in the conventions of this project."""
+        """Return an observation as an instance without a mask, checked by ``check_observation``."""
         T_cam_obj = conventions.check_observation(observation, self.finding.convention)
         part, fraction = observation.part, observation.item.visibility
         keypoints = project_keypoints(part.cuboid, T_cam_obj, observation.K)
@@ -180,7 +180,7 @@ class NddsReader:
         return Instance(part.name, T_cam_obj, keypoints, float(fraction))
 
     def contains(self, label: str) -> bool:
-        """Return whether any item shows this object, reading annotations until one does."""
+        """Return whether the object is annotated on any item; read annotations until it is."""
         return label in self._parts and any(
             self._part(name) is self._parts[label]
             for path in self.items
@@ -188,7 +188,7 @@ class NddsReader:
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Describe items, objects and convention; count instances if the data set is small."""
+        """Return one entry: hashes, pose convention and, for up to 1,000 items, instances."""
         identity: dict[str, object] = {
             "items": hashlib.sha256("\n".join(map(self._key, self.items)).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
@@ -211,7 +211,7 @@ class NddsReader:
 
 
 def _find_items(folder: Path) -> list[Path]:
-    """Return the annotation files with an image."""
+    """Return the annotation files with an image; log the number of others."""
     items, without_image = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
         counts = f"({len(without_image)} JSON files without an image)"

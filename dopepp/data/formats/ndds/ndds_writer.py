@@ -53,14 +53,14 @@ CAMERA_FIELDS: Final = ("width", "height", "intrinsics")
 """Fields of ``camera_data`` that images of one camera share."""
 
 _FARTHEST_PX: Final = 1e6
-"""Largest projected coordinate, since points beside the camera have huge projections."""
+"""Largest projected coordinate: points near the camera's plane have huge projections."""
 
 _DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
-"""Suffixes of files that belong to another data set, like any subfolder."""
+"""Suffixes of files that, like any subfolder, show that a folder holds other data."""
 
 
 class NddsWriter:
-    """Writes samples into an NDDS folder."""
+    """A :class:`~dopepp.data.formats.Writer` of NDDS."""
 
     name = "ndds"
     chunk_size = 1000
@@ -112,11 +112,10 @@ class NddsWriter:
         write_file(self._path(index, ".json"), _encode(record))
 
     def _path(self, index: int, suffix: str) -> Path:
-        """Return the path of an item's file with a suffix."""
         return self._root / f"{index:06d}{suffix}"
 
     def written(self, chunk: int) -> set[int]:
-        """Return the chunk's indices with an annotation."""
+        """Return the indices of the chunk's items whose annotation is on disk."""
         indices = range(chunk * self.chunk_size, (chunk + 1) * self.chunk_size)
         return {index for index in indices if self._path(index, ".json").is_file()}
 
@@ -133,7 +132,7 @@ class NddsWriter:
 
 
 def object_settings(parts: Sequence[Part]) -> dict[str, Any]:
-    """Return the content of ``_object_settings.json``: classes, ids from 1 and box sizes in cm."""
+    """Return the content of ``_object_settings.json``: classes, ids from 1 and box sides in cm."""
     return {
         "exported_object_classes": [part.name for part in parts],
         "exported_objects": [
@@ -183,8 +182,8 @@ def object_record(
 
     Args:
         number: Id of the instance, from 1, and its value in ``.seg.png``.
-        instance: The instance.
-        cuboid_obj: Cuboid of the part, object frame, metres.
+        instance: The annotated object.
+        cuboid_obj: Cuboid corners and centroid of the part, object frame, metres.
         K: Camera matrix in pixels.
     """
     cuboid = transform(instance.T_cam_obj, cuboid_obj)
@@ -229,5 +228,4 @@ def segmentation_map(
 
 
 def _encode(record: dict[str, Any]) -> bytes:
-    """Encode a record as indented JSON."""
     return (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()

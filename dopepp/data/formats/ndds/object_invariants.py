@@ -42,7 +42,7 @@ NORM_TOLERANCE: Final = 0.01
 """Allowed deviations of ``pose_transform`` from a rotation and of a quaternion's norm from 1."""
 
 EDGE_SHARE: Final = 0.02
-"""Allowed inequality and slant of edges; a box with a shorter edge (of the longest) is flat."""
+"""Allowed inequality and slant of edges, of the longest; a box with a shorter edge is flat."""
 
 SIZE_SHARE: Final = 0.05
 """Allowed difference of edges from the class's ``cuboid_dimensions``."""
@@ -64,11 +64,11 @@ _DOCUMENTED: Final = {
 """Conventions that NDDS documents."""
 
 _MAX_MINORITY: Final = 1000
-"""Number of stored objects of each convention, for reports of minorities."""
+"""Largest number of stored objects per convention, for reports of minorities."""
 
 
 class Majority:
-    """Notes the convention of most objects, and reports the objects of other conventions."""
+    """Counts of objects per convention, to report objects that differ from the majority."""
 
     def __init__(self, report: CheckReport) -> None:
         self._report = report
@@ -76,14 +76,14 @@ class Majority:
         self._nodes: dict[tuple[str, str], list[Node]] = {}
 
     def vote(self, subject: str, convention: str, node: Node) -> None:
-        """Count the convention of one object."""
+        """Count one object's convention of ``subject``, e.g. ``bounding_box``."""
         self._votes.setdefault(subject, Counter())[convention] += 1
         nodes = self._nodes.setdefault((subject, convention), [])
         if len(nodes) < _MAX_MINORITY:
             nodes.append(node)
 
     def conclude(self) -> None:
-        """Note each undocumented convention, and report the objects of the minorities."""
+        """Note each majority that NDDS does not document, and report the objects of minorities."""
         for subject, votes in self._votes.items():
             (common, number), *rest = votes.most_common()
             if common != _DOCUMENTED[subject]:
@@ -94,7 +94,7 @@ class Majority:
 
 
 class ObjectCheck:
-    """Checks an object, with lengths in the file's unknown unit; damaged fields are None."""
+    """Check of an object, with lengths in the file's unknown unit; damaged fields are None."""
 
     def __init__(self, parsed: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
         self._node, self._item, self._majority = parsed.node, item, majority
@@ -107,7 +107,7 @@ class ObjectCheck:
     def check(
         self, K: CameraMatrix | None, shape: Shape | None, mask: Mask | None, sides: Vector | None
     ) -> None:
-        """Check pose, cuboid, projections and boxes.
+        """Report contradictions between pose, cuboid, projections, boxes and mask.
 
         Args:
             K: Camera matrix in pixels, if known.
@@ -140,12 +140,12 @@ class ObjectCheck:
         check_box(self._node["box"], points, K, visible_box, fraction, shape)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
-        """Return a field that readers ignore; None if missing or damaged."""
+        """Return a field's numbers; None if missing or, which is reported, damaged."""
         value = self._item.get(field)
         return None if value is None else _finite(self._node[field].numbers(value, *shape))
 
     def _rotations(self) -> dict[str, RotationMatrix]:
-        """Return the rotation by each order of ``quaternion_xyzw``; empty if damaged."""
+        """Return the object's rotation for each order of ``quaternion_xyzw``; empty if damaged."""
         stored = self._quaternion
         if stored is None:
             return {}
@@ -158,7 +158,7 @@ class ObjectCheck:
         return {order: quaternion_to_matrix(values) for order, values in orders.items()}
 
     def _compare_conventions(self, field: str, fits: dict[str, bool], problem: str) -> None:
-        """Report a field that fits no convention, and vote if it fits only one convention."""
+        """Report a field that fits no convention, and count its convention if only some fit."""
         if not any(fits.values()):
             self._node[field].report(problem)
         elif not all(fits.values()):
@@ -168,7 +168,7 @@ class ObjectCheck:
     def _check_cuboid(
         self, corners: Corners, rotations: Mapping[str, RotationMatrix], sides: Vector | None
     ) -> None:
-        """Compare the cuboid with a box, its class's sides and the quaternion."""
+        """Report a cuboid that is no box, or contradicts its class's sides or the quaternion."""
         edges = corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]
         means = edges.mean(axis=1)
         lengths = np.linalg.norm(means, axis=1)
@@ -197,7 +197,7 @@ class ObjectCheck:
             self._compare_conventions("quaternion_xyzw", fits, message)
 
     def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
-        """Check NDDS's matrix: rows P·Rᵀ (P mirrors, as Unreal is left-handed) above location."""
+        """Check ``pose_transform``: rows P·Rᵀ (P mirrors: Unreal is left-handed) above location."""
         for name in ("pose_transform", "pose_transform_permuted"):
             matrix = self._numbers(name, 4, 4)
             if matrix is None:
@@ -225,7 +225,7 @@ class ObjectCheck:
                     self._node[name].report(message)
 
     def _check_bounding_box(self, visible_box: Box | None) -> None:
-        """Compare ``bounding_box``, which may contain hidden pixels, with the visible pixels."""
+        """Report a ``bounding_box`` that does not contain the box of the visible pixels."""
         entry = mapping(self._item.get("bounding_box"))
         if not entry:
             return
@@ -247,7 +247,7 @@ class ObjectCheck:
             self._compare_conventions("bounding_box", fits, problem)
 
     def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
-        """Return the rotation from the file's camera axes into OpenCV's."""
+        """Return the rotation from the file's camera axes to OpenCV's."""
         # A point behind the camera has OpenGL axes if it then projects to the stated corners.
         projected, is_opengl = self._projected, False
         is_before = self._cuboid is not None and self._cuboid[:, 2].mean() > 0
@@ -260,7 +260,7 @@ class ObjectCheck:
         return OPENGL if is_opengl else np.eye(3)
 
     def _is_location_possible(self, location: Vector, axes: RotationMatrix) -> bool:
-        """Check location, centroid and unit; return whether projections are meaningful."""
+        """Check location, centroid and unit; return whether the object may be projected."""
         cuboid, centroid = self._cuboid, self._centroid
         diagonal = None if cuboid is None else float(np.linalg.norm(cuboid[0] - cuboid[6]))
         if not check_translation(self._node["location"], axes @ location, diagonal):
@@ -278,7 +278,7 @@ class ObjectCheck:
         return False
 
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
-        """Compare the annotated projections of the cuboid with its projections at the pose."""
+        """Report annotated projections that differ from those of ``cuboid`` (camera frame)."""
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
             return  # projections of an object partly behind the camera are meaningless
@@ -300,7 +300,7 @@ def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."]
 
 
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
-    """Return the angle to the nearest matrix that permutes and flips axes, radians."""
+    """Return the angle (radians) to the nearest matrix that permutes and flips axes."""
     # The object frames of different tools differ by these matrices.
     nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
     if abs(np.linalg.det(nearest)) != 1:
@@ -309,5 +309,4 @@ def _quarter_turn_distance(rotation: RotationMatrix) -> float:
 
 
 def _text(values: Float[np.ndarray, " n"]) -> str:
-    """Format a vector for a message."""
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -1,4 +1,4 @@
-"""Index BOP-WebDataset shards: tar files of ``KEY.rgb.jpg``, ``KEY.gt.json`` and so on.
+"""Index BOP-WebDataset shards: tar files with members ``KEY.rgb.jpg``, ``KEY.gt.json`` etc.
 
 Indexing reads headers only, and gives random access to the images. Shards are untrusted: paths out
 of the archive, links, holes, truncated or too large members, and repeated names are rejected.
@@ -22,7 +22,7 @@ from dopepp.data.archive import BoundedStream
 from dopepp.data.formats.problems import STRICT, Node, Problems
 
 FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
-"""Members of an image that are read."""
+"""Members of an image that the reader reads."""
 
 MAX_MEMBER_BYTES: Final = 256_000_000
 MAX_MEMBERS: Final = 1_000_000
@@ -50,9 +50,10 @@ class TarMember(NamedTuple):
 
 @dataclass(frozen=True)
 class ShardIndex:
-    """The images of a shard, in its order.
+    """The images of a shard, in the order of the shard.
 
-    ``spans`` holds offset and size of each image's :data:`FIELDS`, −1 for a missing member.
+    ``spans`` holds each image's offset and size, in bytes, of the members in :data:`FIELDS`; −1 for
+    a missing member.
     """
 
     path: Path
@@ -60,13 +61,13 @@ class ShardIndex:
     spans: Int64[np.ndarray, "images 6 2"]
 
     def read(self, image: int, field: str) -> bytes | None:
-        """Return the content of an image's member, or None if missing."""
+        """Return the content of a member in :data:`FIELDS` of an image, or None if missing."""
         offset, size = self.spans[image, FIELDS.index(field)].tolist()
         return None if offset < 0 else read_span(self.path, offset, size)
 
 
 def read_span(path: Path, offset: int, size: int) -> bytes:
-    """Read bytes of a shard.
+    """Read ``size`` bytes of a shard from byte ``offset``.
 
     Raises:
         UserError: The file is missing or truncated.
@@ -173,7 +174,7 @@ def _leads_out(info: tarfile.TarInfo) -> bool:
 
 
 def _problem(info: tarfile.TarInfo, archive_size: int) -> str:
-    """Return why a member is rejected, or an empty string."""
+    """Return why a member of an archive (size in bytes) is rejected, or an empty string."""
     key, dot, _ = PurePosixPath(info.name).name.partition(".")
     if _leads_out(info):
         return "which leads out of the archive"

@@ -1,4 +1,4 @@
-"""Check BOP-WebDataset: tar shards of ``KEY.rgb.jpg``, ``KEY.gt.json`` and so on.
+"""Check BOP-WebDataset: tar files with members ``KEY.rgb.jpg``, ``KEY.gt.json`` etc.
 
 A check reads a shard from start to end, with the members of one image in memory at a time.
 """
@@ -21,7 +21,7 @@ from dopepp.data.formats.webdataset.webdataset_reader import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
 
 _MAX_IMAGE_BYTES: Final = 2 * shards.MAX_MEMBER_BYTES
-"""Limit of the sum over the members of an image."""
+"""Limit of the sum of the sizes of an image's members."""
 
 Content = dict[str, bytes]
 """An image's members by extension."""
@@ -35,7 +35,7 @@ def shard_paths(root: Path) -> Iterator[Path]:
 
 
 def check_webdataset(report: CheckReport) -> None:
-    """Check the models and every shard."""
+    """Check the models, every shard and ``key_to_shard.json``."""
     models = load_models(report, (report.root, *report.root.resolve().parents[:1]))
     shard_names: dict[Path, dict[str, str]] = {}  # by folder and key
     for path in shard_paths(report.root):
@@ -63,7 +63,7 @@ def check_webdataset(report: CheckReport) -> None:
 
 
 def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember]) -> Content:
-    """Read the members of an image, up to the size limit of an image."""
+    """Read the members of an image; skip members beyond the size limit of an image."""
     content: Content = {}
     total = 0
     for _, extension, *span in group:

@@ -49,7 +49,7 @@ _SCHEME: Final = re.compile(r"([a-z][a-z0-9+.-]+):", re.IGNORECASE)
 
 
 class WebdatasetReader:
-    """The images of some shards, in the order of the shards.
+    """Reader of the images of shards, in the order of the shards.
 
     The constructor reads headers; members are read and checked with their image. An image
     without ``gt.json`` has no instances. The reader ignores objects that are not among the parts
@@ -112,12 +112,12 @@ class WebdatasetReader:
         return Sample(image, camera, instances, depth, self.name, shard.keys[row])
 
     def _select_objects(self, poses: bop.BopPoses) -> list[int]:
-        """Return the indices of the parts' objects in front of the camera."""
+        """Return the indices of objects that are among the parts and in front of the camera."""
         is_selected = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
         return [int(number) for number in np.flatnonzero(is_selected)]
 
     def contains(self, label: str) -> bool:
-        """Return whether any image shows this object, reading ground truth until one does."""
+        """Return whether the object is annotated on any image; read annotations until it is."""
         object_ids = {number for number, part in self._parts.items() if part.name == label}
         for shard, row in self._items if object_ids else ():
             poses = _records(shard, row).poses()
@@ -126,7 +126,7 @@ class WebdatasetReader:
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the data by hashes of files and objects, and the origin of the fractions."""
+        """Return one entry: hashes of members and meshes, and the visible fractions' origin."""
         digest, has_infos = hashlib.sha256(), True
         for shard, row in self._items:
             digest.update(shard.keys[row].encode())
@@ -157,16 +157,15 @@ class ShardRecords:
         self.json = cache(self._json)
 
     def _member(self, name: str) -> Node:
-        """Return the node of a JSON member, for error messages."""
         return Node(self._problems, f"{self.start}.{name}.json")
 
     def nodes(self, record_kind: str, number: int) -> Node:
-        """Return the node of a record."""
+        """Return the node of a ``camera``, ``gt`` or ``gt_info`` record, for error messages."""
         member = self._member(record_kind)
         return member if record_kind == "camera" else member[number]
 
     def _json(self, name: str) -> Any:
-        """Return a member's content; None if it is missing or unreadable."""
+        """Return a JSON member's content; None if it is missing, too large or no JSON."""
         content, member = self._read(name), self._member(name)
         if content is None or len(content) <= MAX_BYTES:
             return None if content is None else member.decode(content)
@@ -186,11 +185,11 @@ class ShardRecords:
         return bop.pair_infos(self.truths, self.json("gt_info"), self._member("gt_info"))
 
     def poses(self) -> bop.BopPoses:
-        """Return the ground truth, which may be empty."""
+        """Return the poses of the image's objects; empty without ``gt.json``."""
         return bop.read_poses(self.truths, self.infos, self.nodes)
 
     def mask(self, name: str, number: int, shape: Shape) -> Mask | None:
-        """Return an object's mask from ``mask`` or ``mask_visib``; None if it is damaged."""
+        """Return the mask of object ``number`` from ``mask`` or ``mask_visib``; None if damaged."""
         runs = self.json(name)
         # A mapping by number or, in older shards, a list.
         listed = dict(enumerate(runs)) if isinstance(runs, list) else {}
@@ -199,12 +198,11 @@ class ShardRecords:
 
 
 def _records(shard: ShardIndex, image: int) -> ShardRecords:
-    """Return the JSON members of one image of a shard."""
     return ShardRecords(f"{shard.path}/{shard.keys[image]}", partial(shard.read, image))
 
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:
-    """Check that no two shards contain the same key."""
+    """Raise a UserError if two shards contain the same key."""
     shard_of: dict[str, Path] = {}
     for shard in shards:
         if repeated := [key for key in shard.keys if key in shard_of]:
@@ -298,7 +296,7 @@ def _fetch_shard(url: str, scheme: str, folder: Path | None) -> Path:
 
 
 def _download(url: str, scheme: str, path: Path) -> None:
-    """Download a whole shard of limited size through the library's opener."""
+    """Download a shard of at most ``MAX_SHARD_BYTES`` with the webdataset library."""
     from webdataset.gopen import gopen, gopen_schemes  # imports torch where it is installed
 
     if scheme not in gopen_schemes:

@@ -43,7 +43,7 @@ class WebdatasetWriter(BopFolder):
     name = "webdataset"
 
     def write(self, index: int, sample: Sample) -> None:
-        """Write an image to the staging folder, from which :meth:`finalize` reads it."""
+        """Write an image's archive to the staging folder, from which :meth:`finalize` reads it."""
         labels = self.labels(sample)
         content = {
             "rgb.png": encode_png(sample.image),
@@ -61,7 +61,7 @@ class WebdatasetWriter(BopFolder):
         )
 
     def written(self, chunk: int) -> set[int]:
-        """Return the indices of the shard's complete images."""
+        """Return the indices of the shard's images that are staged or finalized."""
         images = {int(path.stem) for path in self._staged(chunk)}
         if self._shard(chunk).exists():
             images |= {_image_number(member.key) for member in members(self._shard(chunk))}
@@ -83,7 +83,7 @@ class WebdatasetWriter(BopFolder):
                 self._staging(chunk).rmdir()
 
     def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:
-        """Write a shard with its earlier images and the staged images."""
+        """Write a shard again, with its earlier images and the staged images."""
         # The webdataset library's TarWriter writes the same archive but imports torch.
         path = self._shard(chunk)
         partial = partial_path(path)
@@ -106,22 +106,20 @@ class WebdatasetWriter(BopFolder):
             write_file(path, encode_by_key(dict(sorted(merged.items()))))
 
     def _shard(self, chunk: int) -> Path:
-        """Return the path of a chunk's shard."""
         return self.root / self.split / f"shard-{chunk:06d}.tar"
 
     def _staging(self, chunk: int) -> Path:
-        """Return the folder of a chunk's staged images, which are not in the shard yet."""
         return self.root / self.split / STAGING / f"{chunk:06d}"
 
     def _staged(self, chunk: int) -> list[Path]:
-        """Return the files of a chunk's staged images."""
         return staged_items(self._staging(chunk), ".tar")
 
 
 def _merge_images(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
     """Yield key and files of each image of the existing archives, by image number.
 
-    If several archives hold an image, the last archive wins. One image is in memory at a time.
+    If several archives hold an image, its files in the last archive are used. One image is in
+    memory at a time.
     """
     images: dict[int, tuple[Path, list[TarMember]]] = {}
     for path in paths:
@@ -151,5 +149,5 @@ def _add_image(archive: tarfile.TarFile, key: str, content: Content) -> None:
 
 
 def _image_number(key: str) -> int:
-    """Return the image number in a key."""
+    """Return the number of the image in its shard, from a key ``SHARD_IMAGE``."""
     return int(key.rpartition("_")[2])

@@ -79,8 +79,9 @@ class FrameMeta:
 
     Attributes:
         poses: T_cam_obj by class index (from 1), metres; NaN in a damaged pose.
-        columns: Position of each object in the file's ``poses``.
+        columns: Index of the pose in the file's ``poses``, by class index.
         K: Camera matrix in pixels; None if the file does not state it.
+        factor_depth: Units of the depth image per metre; NaN if damaged.
     """
 
     poses: Mapping[int, Transform]
@@ -90,7 +91,7 @@ class FrameMeta:
 
 
 def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
-    """Read a ``meta.mat``.
+    """Read a ``meta.mat`` and report its problems.
 
     Problems are a missing or truncated file, a missing field, and a pose that is not finite, not
     rigid, or behind the camera.
@@ -121,7 +122,7 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
 
 
 def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
-    """Read the fields of a ``-meta.mat`` file; report a damaged file and return None."""
+    """Read the required fields of a ``meta.mat``; report an unreadable file and return None."""
     try:
         size = path.stat().st_size
         content = path.read_bytes() if size <= _MAX_META_BYTES else None
@@ -170,7 +171,7 @@ def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, 
 
 
 def _pose(value: NDArray[Any], node: Node) -> Transform:
-    """Return a 3×4 pose as a transform; report an invalid pose and fill it with NaN."""
+    """Return a 3×4 pose as a rigid transform; report an invalid pose and fill it with NaN."""
     pose = node.numbers(value, 3, 4)
     if problem := rotation_problem(pose[:, :3]):
         node["R"].report(problem, "a rigid transform")
@@ -215,7 +216,7 @@ def read_frame(
 
 
 def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
-    """Read an 8-bit colour image with the expected number of channels."""
+    """Read an 8-bit RGB image, with an alpha channel if ``alpha``."""
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
         problem, allowed = f"shape {image.shape}, {image.dtype}", f"8 bits and {3 + alpha} channels"

@@ -1,4 +1,4 @@
-"""Invariants of YCB-Video, for the frames on disk; listed frames may be missing.
+"""Check the frames of YCB-Video that are on disk; listed frames may be missing.
 
 An object without a label pixel is not a defect: some releases label only some objects.
 """
@@ -70,7 +70,7 @@ def _frames(folder: Path) -> Iterator[str]:
 
 
 class _FrameCheck:
-    """Checks frames; reads an object's points on first use."""
+    """Check of frames, which reads an object's points on first use."""
 
     def __init__(self, report: CheckReport, classes: list[str]) -> None:
         self._report, self._classes, self._size = report, classes, cache(self._read_size)

@@ -37,9 +37,9 @@ _CAMERAS: Final = (
 
 
 class YcbVideoReader:
-    """Real or synthetic frames of a YCB-Video folder.
+    """Reader of the real or the synthetic frames of a YCB-Video folder.
 
-    The visible fraction is the number of label pixels over the area of the convex hull of the
+    The visible fraction is the number of label pixels divided by the area of the convex hull of the
     projected ADD points. The fraction is too small for a concave object (drill, mug), whose hull is
     larger than the silhouette. Some releases label only some objects, so a posed object without a
     label pixel has no mask on a real frame, and its fraction accounts for the image border only.
@@ -88,7 +88,6 @@ class YcbVideoReader:
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
 
     def _present_frames(self, listed: list[str], list_name: str) -> list[str]:
-        """Return the listed frames that are on disk."""
         folder = self.root / ycb_video.FOLDERS[self.subset]
         is_present = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
         absent = [frame for frame in listed if not is_present[frame]]
@@ -130,11 +129,10 @@ class YcbVideoReader:
         return str(self.root / ycb_video.FOLDERS[self.subset] / frame)
 
     def _meta(self, frame: str) -> FrameMeta:
-        """Read the ground truth of a frame."""
         return ycb_video.read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
     def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> RGBImage:
-        """Composite a synthetic frame on a background drawn by (seed, epoch, frame)."""
+        """Return RGB: a synthetic frame is composited on the background of (seed, epoch, frame)."""
         if self.subset == "real" or self._backgrounds is None:
             return image
         rng = item_rng(self._seed, Purpose.BACKGROUND, epoch, int(frame))
@@ -144,14 +142,14 @@ class YcbVideoReader:
         return np.asarray(np.rint(blend), np.uint8)
 
     def contains(self, label: str) -> bool:
-        """Return whether any frame shows this object, reading frames until one does."""
+        """Return whether the object is annotated on any frame; read annotations until it is."""
         class_indices = {index for index, part in self._parts.items() if part.name == label}
         return bool(class_indices) and any(
             not class_indices.isdisjoint(self._meta(frame).poses) for frame in self.frames
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Describe the frames and objects; count instances if the list of frames is short."""
+        """Return one entry: frame and mesh hashes, and instances unless frames exceed 1,000."""
         identity: dict[str, object] = {
             "frames": hashlib.sha256("\n".join(self.frames).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
