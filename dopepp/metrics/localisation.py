@@ -75,7 +75,7 @@ class BopScores:
 
 
 class Localisation:
-    """Accumulates the errors of a method's poses, image by image.
+    """Accumulates pose errors, image by image, for BOP's localisation scores.
 
     VSD needs ``draw``, the renderer of a part's depth.
     """

@@ -277,7 +277,7 @@ class EvaluatedInstances:
         K: Camera matrices, pixels; NaN if unknown.
         visible_fractions: Visible share of each silhouette, in [0, 1].
         scores: Score of each instance's prediction; NaN for a miss.
-        errors: Errors of each instance.
+        errors: Pose errors of the instances, infinite for a miss.
         false_positives: Scores of the false positives.
         num_images: Number of images, with or without the object.
     """

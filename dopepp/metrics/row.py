@@ -331,7 +331,7 @@ _TOTALS: Final = ("num_instances", "false_per_frame")
 
 
 def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
-    """Return the columns of a row; only objects with symmetries have symmetric measures."""
+    """Return a row's columns; unless ``all_measures``, symmetric ones for symmetric parts only."""
     has_symmetries = all_measures or row.num_symmetries > 1
     return [column for column in COLUMNS if has_symmetries or column.group != "symmetry"]
 

@@ -54,7 +54,7 @@ class Backbone(nn.Module, ABC):
 
 
 class _Chain(Backbone):
-    """A sequence of convolution blocks and poolings."""
+    """Convolution blocks and 2×2 max poolings in the order of a plan."""
 
     def __init__(
         self, plan: Plan, width: float, make_block: Callable[[int, int], list[nn.Module]]

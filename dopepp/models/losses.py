@@ -149,7 +149,7 @@ def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
 
 
 def _field_error(field: Tensor, target: Tensor) -> Tensor:
-    """Return the smooth L1 distance of the vectors inside the discs per image.
+    """Return the smooth L1 error of the field per image, over cells with a target vector.
 
     Dividing by the mean number of cells makes the mean over images equal to the mean over cells.
     """

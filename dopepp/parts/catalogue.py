@@ -165,7 +165,7 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
 
 
 def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:
-    """Extrude convex sections from ``foot`` to ``top`` (mm), shrinking them by ``SLOPE``."""
+    """Extrude convex sections from ``foot`` to ``top`` (mm), shrunk by ``SLOPE`` on all sides."""
     # Walls that lean make the features visible from straight above.
     solids = []
     for section in sections:

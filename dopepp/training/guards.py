@@ -46,7 +46,7 @@ _FALL: Final = 0.95  # A validation loss above this share of its first value has
 
 @dataclass
 class _Pass:
-    """A forward and backward pass; ``bad`` marks the values of ``_CHECKED`` that are not finite."""
+    """A forward and backward pass; ``bad`` marks non-finite loss, gradient and statistics."""
 
     batch: Batch
     loss: Tensor
@@ -112,10 +112,10 @@ class FiniteSteps(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Skip the step if the loss, a gradient or a statistic is not finite on any process.
+        """Skip the step if loss, gradient or batch norm statistics are not finite on any process.
 
         Raises:
-            RunError: Too many steps in a row were skipped, or the weights are not finite.
+            RunError: ``max_in_a_row`` steps in a row were skipped, or the weights are not finite.
         """
         passes, self._passes = self._passes, []
         bad = torch.stack([item.bad for item in passes]).sum(dim=0)

@@ -135,7 +135,7 @@ class AveragedWeights(WeightAveraging):
             self._average_model.n_averaged = torch.tensor(1)
 
     def _move(self, averages: list[Tensor], weights: list[Tensor], _: object) -> None:
-        """Move averages of one dtype towards the weights, in place."""
+        """Update averages of one dtype in place by the formula of the class; copy integers."""
         if averages[0].is_floating_point():
             n = int(self._averaged.n_averaged)
             decay = min(self.decay, n / (n + _RAMP - 1))

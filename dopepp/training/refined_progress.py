@@ -71,7 +71,7 @@ class RefinedProgress(Callback):
         self._begin = self._due = time.monotonic()
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Measure if ``every_s`` has passed since the last measurement; stop at ``stop_at``."""
+        """Measure if ``every_s`` has passed; stop the training if ``stop_at`` is reached."""
         assert isinstance(pl_module, PoseSystem)
         reached, start = False, time.monotonic()
         if trainer.is_global_zero and not trainer.sanity_checking and start >= self._due:

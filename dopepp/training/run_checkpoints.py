@@ -200,7 +200,7 @@ def check_free_space(run_dir: Path, weight_bytes: int) -> None:
 
 
 def sweep(run_dir: Path) -> None:
-    """Remove the partial files of processes that no longer run."""
+    """Remove unfinished files of processes that no longer run from the run folder."""
     for folder in (run_dir, run_dir / FOLDER):
         for path in folder.glob(f".*{PARTIAL_SUFFIX}"):
             if is_abandoned(path, time.time()):

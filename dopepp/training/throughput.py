@@ -133,7 +133,7 @@ class Operators(PyTorchProfiler):
 
 
 def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
-    """Build the profiler of ``trainer.profiler``, for the loop's hooks or for torch operators."""
+    """Build a profiler of the loop's hooks (``simple``) or of torch operators (``pytorch``)."""
     if kind == "simple":
         return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
     return None if kind is None else Operators(run_dir / FOLDER)

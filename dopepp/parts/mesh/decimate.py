@@ -62,7 +62,7 @@ def decimate(
 def _cluster(
     vertices: Vertices, faces: Faces, max_faces: int
 ) -> tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, " kept"]]:
-    """Return each vertex's cell and the indices of kept triangles, for a grid within the limit."""
+    """Return each vertex's cell and the indices of kept triangles, at most ``max_faces``."""
     # A surface through a cell becomes two triangles.
     side = float(np.sqrt(2 * face_areas(vertices, faces).sum() / max_faces))
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
@@ -108,7 +108,7 @@ def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
 def _means(
     values: Float[np.ndarray, "values width"], owners: Int[np.ndarray, " values"]
 ) -> Float[np.ndarray, "owners width"]:
-    """Return the mean of the values of each owner."""
+    """Return the mean of the values that have each index in ``owners``."""
     counts = np.maximum(np.bincount(owners), 1)
     sums = [np.bincount(owners, column) for column in values.T]
     return np.stack(sums, axis=1) / counts[:, None]
