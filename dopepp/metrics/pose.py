@@ -319,7 +319,7 @@ class EvaluatedInstances:
         return self.errors.add_or_s < 0.1 * self.part.diameter
 
     def _average_precision(self) -> float:
-        """Return the average precision of all detections of the object."""
+        """Return the average precision of detections; ADD(-S) below 0.1 diameters is correct."""
         hits = self._correct
         misses = ~hits & self.errors.add.isfinite()
         # Wrong predictions precede correct ones of equal score, so that AP does not depend on the

@@ -176,7 +176,7 @@ class GuardedLogger(Logger):
 
 
 def _finish_wandb(failed: bool) -> None:
-    """End the open run of Weights & Biases; on an ``OSError``, also stop its service."""
+    """End the open run of Weights & Biases; on an ``OSError``, stop its service and raise."""
     import wandb  # Weights & Biases is slow to import
 
     try:

@@ -225,7 +225,7 @@ def _log_picture(trainer: Trainer, name: str, image: RGBImage) -> None:
 
 @contextmanager
 def best_effort(name: str) -> Iterator[None]:
-    """Log an ``OSError`` of the context as a failure to write the file ``name``."""
+    """Catch an ``OSError`` in the context and log that the file ``name`` cannot be written."""
     try:
         yield
     except OSError as error:
