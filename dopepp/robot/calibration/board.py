@@ -1,8 +1,9 @@
 """Calibration boards: printing at true scale, detection in images, and their poses.
 
-A board's frame has its origin at the first point, x along the columns, y along the rows and z
-into the board. :func:`draw_view` renders images of a board for simulated calibrations. To add a
-kind of board, extend :meth:`Board.points`, :meth:`Board.drawing` and the ``_detect_`` methods.
+A board's frame has x to the right, y down and z into the board. Its origin is the board's upper
+left corner (ChArUco) or the first point (other kinds). :func:`draw_view` renders images of a board
+for simulated calibrations. To add a kind of board, extend :meth:`Board.points`,
+:meth:`Board.drawing` and the ``_detect_`` methods.
 """
 
 from __future__ import annotations
@@ -48,16 +49,16 @@ Grey = UInt8[np.ndarray, "height width"]
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """A board detected in an image."""
+    """Points of a calibration board that are detected in an image."""
 
     name: str  # name of the image
-    points: Float[np.ndarray, "n 3"]  # detected points in the board's frame, metres
-    pixels: Float[np.ndarray, "n 2"]  # positions of these points in the image
+    points: Float[np.ndarray, "n 3"]  # positions of the detected points on the board, metres
+    pixels: Float[np.ndarray, "n 2"]  # positions of these points in the image, pixels
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """A board's pose in an image."""
+    """Pose of a calibration board in the camera frame, estimated from an image."""
 
     name: str  # name of the image
     T_cam_board: Transform
@@ -65,12 +66,12 @@ class BoardPose:
     # camera axes
     covariance: Float[np.ndarray, "6 6"]
     error_px: float  # RMS reprojection error, pixels
-    distance: float  # distance from the camera to the mean of the points, metres
+    distance: float  # depth of the mean of the detected points along the optical axis, metres
 
 
 @dataclass(frozen=True)
 class Board:
-    """A flat calibration target."""
+    """A flat calibration target: a ChArUco board, a chessboard or an asymmetric circle grid."""
 
     kind: str  # `charuco`, `chess` or `circles`
     columns: int  # squares (ChArUco), inner corners (chess board) or circles in a row
@@ -81,7 +82,7 @@ class Board:
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """All points in the board's frame, metres."""
+        """Corners or circle centres that the detector finds, in the board's frame, metres."""
         if self.kind == "charuco":
             return np.asarray(self._charuco.getChessboardCorners(), np.float64)
         column, row = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
@@ -94,10 +95,10 @@ class Board:
         """Detect the board in an RGB image.
 
         Returns:
-            The detection, or None if fewer than 8 points are visible.
+            The detection, or None if fewer than 8 points are found.
 
         Raises:
-            UserError: Two ChArUco boards of the same kind are visible.
+            UserError: The image shows two ChArUco markers of the same number, i.e. two boards.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         indices, pixels = getattr(self, f"_detect_{self.kind}")(grey)
@@ -109,12 +110,12 @@ class Board:
 
     @property
     def first_px(self) -> float:
-        """Distance of the origin from the drawing's upper and left border, pixels."""
+        """Distance of the board's origin from the upper and left edge of the drawing, pixels."""
         squares = {"charuco": 0.0, "chess": 1.0, "circles": 0.5}[self.kind]
         return PX_PER_MM * (MARGIN_MM + 1000 * squares * self.spacing)
 
     def drawing(self) -> Grey:
-        """Return the printed board, :data:`PX_PER_MM` pixels per millimetre."""
+        """Return the grey image to print, with :data:`PX_PER_MM` pixels per millimetre."""
         step, margin = round(self.spacing * 1000 * PX_PER_MM), MARGIN_MM * PX_PER_MM
         if self.kind == "charuco":
             size = (self.columns * step + 2 * margin, self.rows * step + 2 * margin)
@@ -133,7 +134,7 @@ class Board:
         return page
 
     def write(self, path: Path) -> str:
-        """Write the board for printing (PDF or PNG); return its size with a hint for printing."""
+        """Write a PDF or PNG to print; return a text with the page's size and printing advice."""
         check_target(path, (".pdf", ".png"))
         page, content, dpi = self.drawing(), io.BytesIO(), PX_PER_MM * 25.4
         if path.suffix.lower() == ".pdf":
@@ -146,17 +147,15 @@ class Board:
 
     @cached_property
     def _charuco(self) -> Any:
-        """OpenCV's description of this ChArUco board."""
         size = (self.columns, self.rows)
         return cv2.aruco.CharucoBoard(size, self.spacing, self.marker, _markers(self.dictionary))
 
     @cached_property
     def _detector(self) -> Any:
-        """OpenCV's detector of this ChArUco board."""
         return cv2.aruco.CharucoDetector(self._charuco)
 
     def _detect_charuco(self, grey: Grey) -> tuple[Any, Any]:
-        """Return indices and pixels of the visible ChArUco corners."""
+        """Return indices into :attr:`points` and pixel positions of the detected corners."""
         pixels, indices, _, markers = self._detector.detectBoard(grey)
         if markers is not None and len(np.unique(markers)) < len(markers):
             problem = "an image of two boards with the same markers"
@@ -165,12 +164,13 @@ class Board:
         return ([], []) if indices is None else (np.ravel(indices), pixels)
 
     def _detect_chess(self, grey: Grey) -> tuple[Any, Any]:
-        """Return indices and pixels of the chessboard's corners, from the frame's origin."""
+        """Return indices into :attr:`points` and pixel positions of all inner corners, or none."""
         is_found, pixels = cv2.findChessboardCornersSB(grey, (self.columns, self.rows), None)
         if not is_found:
             return [], []
         pixels = pixels.reshape(-1, 2)
-        # The detector may start at either end. The square before the first corner is black.
+        # The detector may start at either end of the board. Of the two squares compared here, the
+        # first is the darker one if the detector starts at the board's origin.
         grid = pixels.reshape(self.rows, self.columns, 2)
         centres = (grid[:2, k : k + 2].mean(axis=(0, 1)) for k in (0, 1))
         first, second = (
@@ -179,14 +179,13 @@ class Board:
         return np.arange(len(pixels)), pixels if first < second else pixels[::-1]
 
     def _detect_circles(self, grey: Grey) -> tuple[Any, Any]:
-        """Return indices and pixels of the grid's circles."""
+        """Return indices into :attr:`points` and pixel positions of all circles, or none."""
         size, layout = (self.columns, self.rows), cv2.CALIB_CB_ASYMMETRIC_GRID
         is_found, pixels = cv2.findCirclesGrid(grey, size, None, layout)
         return (np.arange(len(pixels)), pixels) if is_found else ([], [])
 
 
 def _markers(dictionary: str) -> Any:
-    """Return an OpenCV dictionary of ArUco markers by its name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
 
 
@@ -194,7 +193,7 @@ def parse_board(text: str) -> Board:
     """Parse a board's description in the notation of :data:`SPELLING`.
 
     Raises:
-        UserError: The description cannot be parsed, or the board is impossible.
+        UserError: The description cannot be parsed, or the board breaks a rule, e.g. on its size.
     """
     try:
         board = _parse(text)
@@ -208,7 +207,7 @@ def parse_board(text: str) -> Board:
 
 
 def _parse(text: str) -> Board:
-    """Parse a board's description; raise a ``ValueError`` if its form is wrong."""
+    """Parse a board's description; raise a ``ValueError`` if it does not follow the notation."""
     kind, _, rest = text.partition(":")
     fields = rest.split(":")
     fewest, most = NUM_FIELDS.get(kind, (0, 0))
@@ -220,7 +219,7 @@ def _parse(text: str) -> Board:
 
 
 def _violated_rule(board: Board) -> str:
-    """Return the rule that the board's dimensions violate, or an empty string."""
+    """Return the first rule on size, spacing or markers that the board breaks, or ""."""
     if min(board.columns, board.rows) < 3 or not board.spacing >= 0.001:
         return "at least 3×3, squares of at least 1 mm"
     if max(board.columns, board.rows) * board.spacing * 1000 > LONGEST_MM:
@@ -241,10 +240,10 @@ def _violated_rule(board: Board) -> str:
 
 
 def board_pose(detection: BoardDetection, camera: Camera) -> BoardPose:
-    """Estimate a board's pose from its points in an image of a calibrated camera.
+    """Estimate the board's pose with the smallest reprojection error in a calibrated camera.
 
     Raises:
-        UserError: The points determine no pose.
+        UserError: OpenCV finds no finite pose for the detected points.
     """
     points, pixels = detection.points, detection.pixels
     lens = (camera.K, camera.coefficients)
@@ -272,7 +271,7 @@ def board_pose(detection: BoardDetection, camera: Camera) -> BoardPose:
 def _pose_jacobian(
     points: Float[np.ndarray, "n 3"], T: Transform, camera: Camera
 ) -> Float[np.ndarray, "m 6"]:
-    """Return the derivative of the pixels by a rotation about the origin and a translation."""
+    """Return the derivative of the projected points (px) with respect to `displace`'s step."""
     columns = []
     for step in np.diag([1e-5] * 3 + [1e-6] * 3):
         sides = []
@@ -286,7 +285,10 @@ def _pose_jacobian(
 
 
 def displace(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
-    """Rotate poses about their own origins and translate them."""
+    """Rotate and translate poses in parent axes, each about the pose's origin.
+
+    ``step`` has a rotation vector (radians) and a translation (metres) for each pose.
+    """
     moved = T.copy()
     moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
     moved[:, :3, 3] += step[:, 3:]
@@ -300,9 +302,9 @@ def draw_view(
     rng: np.random.Generator,
     noise: float = 4.0,
 ) -> RGBImage:
-    """Render a board at a pose, with the camera's distortion and noise (grey levels).
+    """Render a board with lens distortion, blur and noise; each pixel averages 2×2 rays.
 
-    Every pixel averages 2×2 rays, which are intersected with the board's plane.
+    ``noise`` is the standard deviation of the Gaussian pixel noise in grey levels (0 to 255).
     """
     assert camera.size is not None
     width, height = camera.size

@@ -44,31 +44,38 @@ ROBOT_NOISE: Final = (0.0005, 0.0005)
 """Initial standard deviations of a robot's pose, radians and metres."""
 
 OUTLIER: Final = 40.0
-"""Squared Mahalanobis distance of a rejected pose. With six degrees of freedom, one in two million
-correct poses exceeds it."""
+"""Squared Mahalanobis distance above which a pose is rejected. With six degrees of freedom, one in
+two million correct poses exceeds it."""
 
 MEDIAN_CHI2: Final = 5.348  # median of chi-squared with six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """Poses of the camera and the board."""
+    """Hand-eye calibration: the poses of the camera and the board, and their errors."""
 
     mount: Mount  # `hand` (the camera is on the flange) or `bench`
     T_mount_cam: Transform  # T_flange_cam, or T_base_cam of a camera on the bench
-    T_other_board: Transform  # T_base_board, or T_flange_board
-    # Covariance of the camera's rotation about its origin (radians) and translation (metres)
+    T_other_board: Transform  # T_base_board, or T_flange_board of a camera on the bench
+    # Covariance of the camera's rotation about its origin (radians) and translation (metres),
+    # camera axes
     covariance: Float[np.ndarray, "6 6"]
-    rotation_errors: Float[np.ndarray, "poses"]  # rotation error of every pose, radians
-    shifts: Float[np.ndarray, "poses"]  # translation error, metres
+    # Rotation (radians) and distance (metres) between each observed and predicted T_cam_board
+    rotation_errors: Float[np.ndarray, "poses"]
+    shifts: Float[np.ndarray, "poses"]
     inliers: Bool[np.ndarray, "poses"]  # poses that were not rejected
-    robot_noise: tuple[float, float]  # estimated error of the robot, radians and metres
+    robot_noise: tuple[float, float]  # standard deviations of the flange's pose, radians and metres
 
 
 def calibrate_hand_eye(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
 ) -> HandEye:
-    """Estimate the camera's pose from poses of the flange and of the board in its images.
+    """Estimate the camera's pose on its mount from poses of the flange and of the board.
+
+    Args:
+        T_base_flange: Poses of the flange that the robot reports, metres.
+        boards: Pose of the board in the image taken at each flange pose, in the same order.
+        mount: ``hand`` for a camera on the flange, ``bench`` for a fixed camera.
 
     Raises:
         UserError: There are fewer than three poses.
@@ -102,7 +109,10 @@ def calibrate_hand_eye(
 def robot_world_equations(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
 ) -> tuple[Transforms, Transforms, Covariances]:
-    """Return M and B of M_i X B_i = Y, and the covariances of B."""
+    """Return M, B = T_cam_board and B's covariances of M X B = Y (see :mod:`.hand_eye`).
+
+    M is T_base_flange for a camera on the hand, and T_flange_base for a camera on the bench.
+    """
     M = np.asarray(T_base_flange, np.float64)
     B = np.stack([board.T_cam_board for board in boards])
     covariances = np.stack([board.covariance for board in boards])
@@ -110,9 +120,9 @@ def robot_world_equations(
 
 
 def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
-    """Solve M_i X B_i = Y by pairs: (M_j⁻¹ M_i) X = X (B_j B_i⁻¹) (Park and Martin 1994).
+    """Solve M_i X B_i = Y for the poses X of the camera and Y of the board (Park and Martin 1994).
 
-    The rotation vectors α = R_X β are aligned over all pairs. Translations follow linearly.
+    R_X aligns the rotation vectors in (M_j⁻¹ M_i) X = X (B_j B_i⁻¹). Translations are linear then.
     """
     P, Q = relative_motions(M, B)
     alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
@@ -126,10 +136,10 @@ def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
 
 
 def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
-    """Solve M_i X = Y B_i⁻¹ for X and Y at once (Shah 2013).
+    """Solve M_i X = Y B_i⁻¹ for the poses X of the camera and Y of the board (Shah 2013).
 
     vec(R_Y) = (R_C ⊗ R_M) vec(R_X) with C = B⁻¹, so both rotations are the leading singular
-    vectors of the sum over all poses. Translations follow linearly.
+    vectors of the sum over all poses. The translations solve a linear system.
     """
     C = invert_transforms(B)
     kronecker = np.einsum("nij,nkl->ikjl", C[:, :3, :3], M[:, :3, :3]).reshape(9, 9)
@@ -143,7 +153,7 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
 
 
 def relative_motions(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
-    """Return the motions M_j⁻¹ M_i of the robot and B_j B_i⁻¹ of the board, i < j."""
+    """Return the motions M_j⁻¹ M_i of the robot and B_j B_i⁻¹ of the board for all pairs i < j."""
     i, j = np.triu_indices(len(M), 1)
     return invert_transforms(M)[j] @ M[i], B[j] @ invert_transforms(B)[i]
 
@@ -151,12 +161,12 @@ def relative_motions(M: Transforms, B: Transforms) -> tuple[Transforms, Transfor
 def refine(
     M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
-    """Refine X and Y by robust least squares.
+    """Refine X and Y of M_i X B_i = Y by least squares with a soft L1 loss.
 
     Args:
         M: Transforms of the robot, as in :func:`robot_world_equations`.
-        B: Transforms of the board.
-        B_cov: Covariances of B.
+        B: Poses T_cam_board of the board.
+        B_cov: Covariances of B, as in :class:`.BoardPose`.
         X: Initial pose of the camera.
         Y: Initial pose of the board.
         robot: Standard deviations of the robot's rotation (radians) and position (metres).
@@ -180,7 +190,7 @@ def refine(
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return each pose's error of M X B = Y: rotation about the board's origin and translation."""
+    """Return the rotation and translation from X⁻¹ M⁻¹ Y, the expected board pose, to B."""
     expected = invert_transform(X) @ invert_transforms(M) @ Y
     rotvec = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([rotvec, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
@@ -189,13 +199,9 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
 def _covariances(
     M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
 ) -> Covariances:
-    """Return the covariances of :func:`_residuals`, camera axes.
-
-    Each covariance is the sum of the board's covariance ``B_cov`` and of the robot's covariance,
-    which is propagated to the pose of the board.
-    """
-    # Derivative of the board's pose, in camera axes, by a small rotation (about the origin of the
-    # camera's mount) and translation of the robot's pose.
+    """Return the covariances of :func:`_residuals`: ``B_cov`` plus the propagated robot noise."""
+    # Derivative of the board's pose by a small rotation (about the origin of the camera's mount)
+    # and translation of the robot's pose.
     to_cam = X[:3, :3].T
     jacobian = np.zeros((len(M), 6, 6))
     jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam
@@ -205,9 +211,9 @@ def _covariances(
 
 
 def _robot_noise(residuals: Residuals, B_cov: Covariances) -> Noise:
-    """Estimate the robot's standard deviations (radians, metres) from residuals.
+    """Estimate the robot's noise from the median squared residuals minus the board's variances.
 
-    Medians make the estimate robust. Its minimum is a fifth of :data:`ROBOT_NOISE`.
+    The smallest estimate is a fifth of :data:`ROBOT_NOISE`.
     """
     excess = residuals**2 - 0.455 * np.diagonal(B_cov, axis1=1, axis2=2)
     variances = np.array([np.median(excess[:, k : k + 3]) / 0.455 for k in (0, 3)])
@@ -217,14 +223,14 @@ def _robot_noise(residuals: Residuals, B_cov: Covariances) -> Noise:
 def _distances(
     M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
 ) -> Float[np.ndarray, "poses"]:
-    """Return every pose's squared Mahalanobis distance from its expected pose."""
+    """Return each board pose's squared Mahalanobis distance from X⁻¹ M⁻¹ Y, the expected pose."""
     residuals = _residuals(M, B, X, Y)
     whole = np.linalg.solve(_covariances(M, X, Y, B_cov, robot), residuals[..., None])[..., 0]
     return np.asarray((residuals * whole).sum(axis=1))
 
 
 def invert_transforms(T: Transforms) -> Transforms:
-    """Return the inverse of every rigid transform."""
+    """Return the inverses of rigid transforms."""
     R = T[:, :3, :3].transpose(0, 2, 1)
     inverse = np.tile(np.eye(4), (len(T), 1, 1))
     inverse[:, :3, :3] = R
@@ -233,7 +239,7 @@ def invert_transforms(T: Transforms) -> Transforms:
 
 
 def _cross(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return the cross-product matrix of every vector."""
+    """Return the matrix [v]× of each vector v, with [v]× w = v × w."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

@@ -18,7 +18,7 @@ from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import MIN_POINTS, BoardDetection
 
-MIN_VIEWS: Final = 6  # views of a reliable calibration; three views determine K
+MIN_VIEWS: Final = 6  # smallest number of views of a reliable calibration; 3 views determine K
 CELLS: Final = (8, 6)  # columns and rows of the grid that measures the coverage
 MIN_COVERAGE: Final = 0.5
 MIN_TILT: Final = 0.2
@@ -37,9 +37,10 @@ CHECKS_PER_S: Final = 5.0  # frames of a video in which the board is searched, p
 
 
 class Views:
-    """Keeps distinct views of a board, and of similar views the view with the least motion.
+    """Views of a board whose points differ by more than 4 % of the image's width on average.
 
-    In a video, sharp frames from pauses therefore replace frames with motion blur.
+    Of similar views, the view with the smallest shift from the previous frame is kept, so that
+    sharp frames of a video replace frames with motion blur.
 
     Args:
         width: Width of the images, pixels.
@@ -52,7 +53,7 @@ class Views:
         self._last: BoardDetection | None = None
 
     def add(self, detection: BoardDetection) -> bool:
-        """Process the next detection; return whether its view is new."""
+        """Add the next frame's detection; return whether it differs from all views kept so far."""
         motion = np.inf if self._last is None else _shift(self._last, detection)
         self._last = detection
         shifts = [_shift(view, detection) for view in self.kept]
@@ -67,12 +68,12 @@ class Views:
 
     @property
     def is_full(self) -> bool:
-        """Whether further views would not improve a calibration noticeably."""
+        """Whether 60 views are kept; further views hardly improve a calibration."""
         return len(self.kept) >= MAX_VIEWS
 
 
 def _shift(first: BoardDetection, second: BoardDetection) -> float:
-    """Return the mean shift of the common points, pixels; infinite for too few points."""
+    """Return the mean shift of the common points in pixels, or inf for less than 8 such points."""
     is_same = (first.points[:, None] == second.points[None]).all(axis=2)
     rows, columns = np.nonzero(is_same)
     if len(rows) < MIN_POINTS:
@@ -82,30 +83,30 @@ def _shift(first: BoardDetection, second: BoardDetection) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LensCalibration:
-    """A calibrated camera and its quality."""
+    """Intrinsics of a camera from images of a board, and measures of their quality."""
 
     camera: Camera
     error_px: float  # RMS reprojection error over all used views, pixels
     names: tuple[str, ...]  # image of each view used in the calibration
     errors_px: Float[np.ndarray, "views"]  # RMS reprojection error of each view, pixels
     outliers: tuple[str, ...]  # names of views rejected for large errors
-    coverage: float  # share of the image's cells (8×6) with points
-    covered: Bool[np.ndarray, "rows columns"]  # cells of the image with points
+    coverage: float  # share of the 8×6 image cells that contain a detected point, 0 to 1
+    covered: Bool[np.ndarray, "rows columns"]  # image cells that contain a detected point
     deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
     findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
 
 def calibrate_lens(detections: Sequence[BoardDetection], size: Size) -> LensCalibration:
-    """Calibrate a camera from views of a board.
+    """Estimate a camera's intrinsics and lens distortion from views of a board.
 
-    Views with far larger errors than the others are rejected, in a single pass.
+    Views with a reprojection error above 0.5 px and 3 times the median are rejected once.
 
     Args:
-        detections: The board's points in the images.
+        detections: Detected points of the board, one detection per image.
         size: Width and height of the images, pixels.
 
     Raises:
-        UserError: There are fewer than three views, or the views determine no camera.
+        UserError: There are fewer than three views, or OpenCV cannot solve for the camera.
     """
     if len(detections) < 3:
         raise UserError(
@@ -125,7 +126,7 @@ def calibrate_lens(detections: Sequence[BoardDetection], size: Size) -> LensCali
 
 
 def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
-    """Calibrate the camera with OpenCV from all views, without rejection."""
+    """Calibrate the camera with OpenCV from all views, without rejection of outliers."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:
@@ -158,7 +159,7 @@ def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
 
 
 def write_camera(path: Path, camera: Camera, trusted: bool = True) -> None:
-    """Write a camera as ROS's ``camera_info`` YAML, a format of every ``--camera`` option."""
+    """Write a camera as ROS's ``camera_info`` YAML, with a warning in it unless ``trusted``."""
     check_target(path, (".yaml", ".yml"))
     assert camera.size is not None
     lens = list(camera.distortion)
@@ -184,7 +185,7 @@ def _matrix(values: Float[np.ndarray, "rows columns"]) -> dict[str, object]:
 
 
 def _findings(num_views: int, coverage: float, tilt: float, error_px: float) -> tuple[str, ...]:
-    """Return reasons not to trust a calibration."""
+    """Return reasons not to trust a calibration; for ``tilt``, see :data:`MIN_TILT`."""
     findings = {
         f"only {num_views} views: take at least {MIN_VIEWS}": num_views < MIN_VIEWS,
         f"points cover {coverage:.0%} of the image: move the board to its borders and corners, "

@@ -29,16 +29,16 @@ from dopepp.robot.calibration.hand_eye import (
 from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
 
-MIN_ROTATION: Final = np.radians(5.0)  # smallest valid rotation between the two farthest poses
+MIN_ROTATION: Final = np.radians(5.0)  # smallest valid maximum of the rotations between two poses
 MAX_ROTATION_ERROR: Final = np.radians(1.5)
-"""Largest median rotation error over pairs under the correct convention."""
+"""Largest median rotation error over pairs under the correct convention, radians."""
 MAX_SHIFT_ERROR: Final = 0.01
 """Largest median translation error over pairs under the correct convention, metres."""
-SCALE: Final = 1.03  # largest negligible factor between robot's and camera's lengths
+SCALE: Final = 1.03  # largest negligible factor between the robot's and the camera's lengths
 MIN_POSES: Final = 8
 
 MIN_DIVERSITY: Final = np.radians(15.0)
-"""Smallest RMS rotation over pairs about the second most common axis."""
+"""Smallest RMS rotation over pairs about the second main axis (:class:`CalibrationQuality`)."""
 
 MAX_ERROR: Final = 0.003  # largest standard deviation at the board's distance, metres
 MAX_ROTATION: Final = np.radians(0.5)  # largest standard deviation of the rotation
@@ -47,29 +47,32 @@ MIN_USED: Final = 0.7  # share of poses that agree with each other
 
 @dataclass(frozen=True)
 class MotionAgreement:
-    """Agreement between the motions of robot and board."""
+    """Errors of P X = X Q for the motions P of the robot and Q of the board between two images.
+
+    X is the camera's pose on its mount that fits all pairs of images best.
+    """
 
     rotation: float  # median rotation error over pairs, radians
-    shift: float  # median translation error, metres
-    scale: float  # factor that corrects the robot's lengths
+    shift: float  # median translation error over pairs, metres
+    scale: float  # factor by which the robot's lengths must be multiplied to fit the board's
 
     @property
     def is_rigid(self) -> bool:
-        """Whether a single mount explains all motions up to a common factor of the lengths."""
+        """Whether the median errors are below 1.5° and 10 mm after correction by ``scale``."""
         return self.rotation < MAX_ROTATION_ERROR and self.shift < MAX_SHIFT_ERROR
 
     @property
     def is_consistent(self) -> bool:
-        """Whether a single mount explains all motions."""
+        """Whether :attr:`is_rigid` holds and ``scale`` differs from 1 by at most about 3 %."""
         return self.is_rigid and 1 / SCALE < self.scale < SCALE
 
 
 def compare_motions(T_base_flange: Transforms, B: Transforms, mount: Mount) -> MotionAgreement:
-    """Compare the motions of robot and board.
+    """Compare the motions of the robot's flange and of the board between all pairs of images.
 
     Args:
-        T_base_flange: Poses that the robot reports.
-        B: Poses of the board in the camera, as in :func:`.hand_eye.robot_world_equations`.
+        T_base_flange: Poses of the flange that the robot reports, metres.
+        B: Pose T_cam_board of the board in the image at each flange pose, metres.
         mount: Whether the camera is on the robot's hand or on the bench.
     """
     P, Q = relative_motions(
@@ -98,7 +101,7 @@ def compare_motions(T_base_flange: Transforms, B: Transforms, mount: Mount) -> M
 
 
 def _robust_weights(errors: Float[np.ndarray, "pairs"]) -> Float[np.ndarray, "pairs"]:
-    """Return smaller weights for errors above the median."""
+    """Return the Cauchy weight 1 / (1 + (error / median)²) of each error."""
     return np.asarray(1 / (1 + (errors / max(np.median(errors), 1e-6)) ** 2))
 
 
@@ -109,21 +112,21 @@ def check_poses(
     boards: Sequence[BoardPose],
     mount: Mount,
 ) -> Transforms:
-    """Check robot poses against the board's poses.
+    """Check that the robot's motions agree with the board's motions in the images.
 
     Args:
-        poses: The robot's poses.
-        chosen: Index of the pose that belongs to each board.
-        pose_format: Conventions of the robot's poses.
-        boards: The board's poses in the images.
-        mount: Mount of the camera.
+        poses: Robot poses of a file.
+        chosen: Index into ``poses`` for each entry of ``boards``.
+        pose_format: Conventions of the file: units, order of quaternions, direction.
+        boards: Poses of the board in the images.
+        mount: Whether the camera is on the robot's hand or on the bench.
 
     Returns:
-        T_base_flange of the chosen poses.
+        T_base_flange of the chosen poses, metres.
 
     Raises:
-        UserError: The robot or the board did not move, or poses and images contradict each other.
-            The message names the conventions that fit, if any.
+        UserError: The robot or the board rotates by less than 5° between any two poses, or their
+            motions disagree. The message names conventions under which they agree, if any.
     """
     B = np.stack([board.T_cam_board for board in boards])
     flanges = poses.transforms(pose_format)[list(chosen)]
@@ -170,7 +173,7 @@ def _check_motion(T: Transforms, body: str, source: str) -> None:
 
 
 def _other_formats(poses: RobotPoses, pose_format: PoseFormat) -> Iterator[tuple[PoseFormat, str]]:
-    """Yield conventions with the option that selects them, the user's convention first."""
+    """Yield ``pose_format`` and its other angle unit or quaternion order, with the CLI option."""
     yield pose_format, ""
     if poses.kind == "quaternion":
         order, position = ("xyzw", "last") if pose_format.order == "wxyz" else ("wxyz", "first")
@@ -184,7 +187,7 @@ def _other_formats(poses: RobotPoses, pose_format: PoseFormat) -> Iterator[tuple
 def _format_error(
     source: str, advice: str, same_mount: bool, scale: float, pose_format: PoseFormat
 ) -> UserError:
-    """Return the error for robot poses that fit the images under other conventions."""
+    """Return the error that names the conventions under which robot poses fit the images."""
     changes = [advice] if advice else []
     if not same_mount:
         changes.append(
@@ -202,7 +205,7 @@ def _format_error(
 
 
 def _scale_error(scale: float, unit: str, source: str) -> UserError:
-    """Return the error for robot positions, read in a unit, that are wrong by a factor."""
+    """Return the error for robot positions in ``unit`` that should be ``scale`` times as large."""
     factor, right = 1 / scale, _unit_of(scale, unit)
     if right is not None:
         problem = f"{source} in {unit}, which makes the robot's motions {factor:.4g} times too long"
@@ -216,7 +219,7 @@ def _scale_error(scale: float, unit: str, source: str) -> UserError:
 
 
 def _unit_of(scale: float, unit: str) -> str | None:
-    """Return the unit that a factor on the lengths implies."""
+    """Return the length unit that is ``scale`` times ``unit`` within 3 %, or None."""
     for name, metres in UNITS.items():
         if 1 / SCALE < scale * UNITS[unit] / metres < SCALE:
             return name
@@ -225,22 +228,22 @@ def _unit_of(scale: float, unit: str) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationQuality:
-    """Quality of a hand-eye calibration."""
+    """Quality of a hand-eye calibration: expected errors, variety of the motions, and advice."""
 
     shift: float  # expected error of positions at the board's distance (1 σ), metres
-    rotation: float  # expected error of the rotation (1 σ), radians
+    rotation: float  # expected error of the camera's rotation (1 σ), radians
     # Distance by which the camera moves if the calibration omits a pose, for each pose, metres
     leave_one_out: Float[np.ndarray, "poses"]
-    diversity: Vector  # RMS rotation over pairs about the main axes, radians, descending
-    weakest: Vector  # least certain direction of the camera's position, in the mount's frame
-    next_pose: str  # the most useful pose to add
+    diversity: Vector  # RMS rotation over pairs about the 3 principal axes, radians, descending
+    weakest: Vector  # direction of the largest position variance, unit vector in the mount's frame
+    next_pose: str  # advice on the rotation that reduces the largest position variance
     findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
 
 def assess(
     T_base_flange: Transforms, boards: Sequence[BoardPose], calibration: HandEye
 ) -> CalibrationQuality:
-    """Assess a hand-eye calibration from its result and its inputs."""
+    """Assess a hand-eye calibration from its result and the poses it was estimated from."""
     M, B, B_cov = robot_world_equations(T_base_flange, boards, calibration.mount)
     alpha = Rotation.from_matrix(relative_motions(M, B)[0][:, :3, :3]).as_rotvec()
     diversity = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
@@ -276,11 +279,11 @@ def assess(
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:
-    """Return the standard deviations of a point's position (metres) and of a rotation (radians).
+    """Return the 3D standard deviations of a point (metres) and of the rotation (radians).
 
     Args:
         covariance: Covariance of the camera's pose, as in :class:`HandEye`.
-        distance: Distance of the point in front of the camera, metres.
+        distance: Distance of the point from the camera along the optical axis, metres.
     """
     across = np.array([[0, distance, 0], [-distance, 0, 0], [0, 0, 0]])
     jacobian = np.hstack([across, np.eye(3)])

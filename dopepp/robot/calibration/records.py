@@ -47,7 +47,7 @@ Record = Mapping[object, object]
 
 @dataclass(frozen=True)
 class PoseFormat:
-    """Conventions of a file of poses."""
+    """Conventions of a file of robot poses: units, order of quaternions, direction."""
 
     unit: str = "m"  # length unit of positions: m, mm, cm or inch
     degrees: bool = False  # whether angles are in degrees (default: radians)
@@ -57,16 +57,16 @@ class PoseFormat:
 
 @dataclass(frozen=True, eq=False)
 class RobotPoses:
-    """Poses of a file in the file's own conventions."""
+    """Robot poses as written in a file, before conversion of units and conventions."""
 
     names: tuple[str, ...]  # file name of each image, empty if the record has none
-    positions: Float[np.ndarray, "poses 3"]  # x, y, z
-    kind: str  # a key of `ROTATIONS`, or `matrix`
-    rotations: Float[np.ndarray, "poses numbers"]  # the numbers of this kind
-    source: str  # the file
+    positions: Float[np.ndarray, "poses 3"]  # x, y, z in the file's length unit
+    kind: str  # representation of the rotations: a key of `ROTATIONS`, or `matrix`
+    rotations: Float[np.ndarray, "poses numbers"]  # 4, 3 or (matrix, row by row) 9 numbers each
+    source: str  # path of the file, for messages
 
     def transforms(self, pose_format: PoseFormat) -> Float[np.ndarray, "poses 4 4"]:
-        """Return T_base_flange of every pose, metres."""
+        """Return T_base_flange of each pose in metres; ``pose_format`` describes the file."""
         numbers, degrees = self.rotations, pose_format.degrees
         if self.kind == "quaternion":
             is_w_first = pose_format.order == "wxyz"
@@ -84,7 +84,7 @@ class RobotPoses:
 
 
 def read_robot_poses(path: Path) -> RobotPoses:
-    """Read a file of robot poses.
+    """Read a CSV, JSON or YAML file of robot poses.
 
     Raises:
         UserError: The file is missing, too large or damaged, does not have the fields of
@@ -122,10 +122,11 @@ def read_robot_poses(path: Path) -> RobotPoses:
 
 
 def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
-    """Read a CSV of points that a tool's tip touched, x, y, z in the base's frame.
+    """Read a CSV file of points x, y, z in the robot base's frame; return them in metres.
 
-    Returns:
-        The points in metres.
+    Args:
+        path: CSV file.
+        unit: Length unit of the file, a key of :data:`UNITS`.
 
     Raises:
         UserError: As for :func:`read_robot_poses`.
@@ -134,7 +135,7 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
 
 
 def _read_csv(path: Path) -> list[Record]:
-    """Read the rows of a CSV file with a header."""
+    """Read the rows of a CSV file as mappings from lower-case column names to texts."""
     try:
         text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
     except (OSError, ValueError) as error:
@@ -147,7 +148,7 @@ def _read_csv(path: Path) -> list[Record]:
 
 
 def _records(content: object, path: Path) -> list[Record]:
-    """Return the records of a list, or of a mapping from names of images to records."""
+    """Return the records in parsed JSON or YAML: a list, or a mapping from image names."""
     if isinstance(content, Mapping):
         content = [
             {"name": name, **record} if isinstance(record, Mapping) else record
@@ -161,7 +162,7 @@ def _records(content: object, path: Path) -> list[Record]:
 def _numbers(
     records: Sequence[Record], keys: Sequence[str], path: Path
 ) -> Float[np.ndarray, "records keys"]:
-    """Return the fields of all records as finite numbers."""
+    """Return the fields ``keys`` of all records; raise a ``UserError`` unless all are finite."""
 
     def number(record: Record, key: str, row: int) -> float:
         try:
@@ -179,7 +180,7 @@ def _numbers(
 
 
 def _matrix(record: Record, row: int, path: Path) -> Transform:
-    """Return the 4×4 ``matrix`` of a record; reject a matrix that is not a rigid transform."""
+    """Return a record's 4×4 ``matrix``; raise a ``UserError`` if it is no rigid transform."""
     try:
         T = np.array(record["matrix"], np.float64).reshape(4, 4)
     except (KeyError, TypeError, ValueError):
@@ -194,11 +195,14 @@ def _matrix(record: Record, row: int, path: Path) -> Transform:
 
 
 def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
-    """Return the index of the pose of each image: by name if the poses have names, else in order.
+    """Match poses with images by name (with or without suffix) or, without names, by order.
+
+    Returns:
+        Index of the pose by name of the image.
 
     Raises:
-        UserError: A named image is missing, or there are no names and the numbers of poses and
-            images differ.
+        UserError: A pose names an image that does not exist, or there are no names and the numbers
+            of poses and images differ.
     """
     if any(poses.names):
         full_names = {name: name for name in images}
@@ -223,12 +227,12 @@ def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
 def write_calibration(
     path: Path, kind: str, values: Mapping[str, Any], findings: Sequence[str], force: bool
 ) -> None:
-    """Write a calibration, unless findings contradict it.
+    """Write the result of a calibration to a YAML file.
 
     Args:
-        path: YAML file to write.
+        path: File with the suffix ``.yaml`` or ``.yml``.
         kind: Kind of the calibration, e.g. ``hand-eye``.
-        values: Content of the file by field.
+        values: Fields of the result, e.g. its matrix and errors.
         findings: Reasons not to trust the calibration.
         force: Whether to write despite findings; the file is then marked as not trusted.
 
@@ -245,10 +249,10 @@ def write_calibration(
 
 
 def check_trust(findings: Sequence[str], force: bool) -> None:
-    """Check that a calibration has no findings.
+    """Reject a calibration that has findings, i.e. reasons not to trust it.
 
     Raises:
-        UserError: There are findings, and ``force`` is not set.
+        UserError: There are findings, and ``force`` is false.
     """
     if findings and not force:
         problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"

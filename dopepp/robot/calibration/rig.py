@@ -44,21 +44,21 @@ BoardPoses = Mapping[str, Mapping[str, BoardPose]]  # by camera and moment
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Poses of the cameras of a rig, and their quality."""
+    """Poses of several fixed cameras in the frame of the first camera, and their errors."""
 
-    names: tuple[str, ...]  # of the cameras; the first is the world's frame
-    T_world_cam: Transforms
+    names: tuple[str, ...]  # names of the cameras; the frame of the first camera is the world
+    T_world_cam: Transforms  # pose of each camera
     # Covariance of each camera's rotation about its centre (radians) and translation (metres),
     # world axes
     covariances: Float[np.ndarray, "cameras 6 6"]
     errors_px: Float[np.ndarray, "cameras"]  # RMS reprojection error of each camera, pixels
     shared: tuple[int, ...]  # number of moments at which each camera and another see the board
-    outliers: tuple[str, ...]  # rejected moments, which contradict the others
+    outliers: tuple[str, ...]  # moments that were rejected for their reprojection error
     findings: tuple[str, ...]  # reasons not to trust the rig, with remedies
 
     @property
     def deviations(self) -> Float[np.ndarray, "cameras 2"]:
-        """Standard deviations of each camera along and about an axis, metres and radians (RMS)."""
+        """Standard deviations of position (metres) and rotation (radians), RMS over the 3 axes."""
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)
         rotations, shifts = variances[:, :3].mean(axis=1), variances[:, 3:].mean(axis=1)
         return np.asarray(np.sqrt(np.stack([shifts, rotations], axis=1)))
@@ -68,8 +68,8 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     """Estimate the poses of cameras from images of a board that they see together.
 
     Args:
-        boards: Detections of the board by each camera.
-        cameras: Calibrated camera of the same names.
+        boards: Detections of the board by camera name and moment (name of the image).
+        cameras: Intrinsics of each camera, by the same names.
 
     Raises:
         UserError: The number of cameras is out of range, or a camera never sees the board together
@@ -120,10 +120,12 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
 
 
 def _link_cameras(poses: BoardPoses) -> dict[str, Transform]:
-    """Return T_world_cam of every camera, linked to the first by moments that two cameras share.
+    """Return initial values of T_world_cam by camera name; the first camera is the world.
+
+    The next camera is always the camera that shares most moments with a camera whose pose is known.
 
     Raises:
-        UserError: A camera shares no moment with the linked cameras.
+        UserError: A camera shares no moment with the cameras whose poses are known.
     """
     first, *others = poses
     linked = {first: np.eye(4)}
@@ -153,16 +155,16 @@ def _link_cameras(poses: BoardPoses) -> dict[str, Transform]:
 
 
 def _most_central(steps: Transforms) -> Transform:
-    """Return the transform with the smallest sum of distances from the others."""
+    """Return the transform with the smallest sum of Frobenius distances from the others."""
     flat = steps[:, :3].reshape(len(steps), -1)
     distances = np.linalg.norm(flat[:, None] - flat[None], axis=2).sum(axis=1)
     return np.asarray(steps[distances.argmin()])
 
 
 class _Adjustment:
-    """Bundle adjustment of cameras and boards.
+    """Bundle adjustment: refines the poses of cameras and boards by all reprojection errors.
 
-    Unknowns are a rotation and a shift of every camera but the first, then of every board.
+    The unknowns are a rotation and translation of each camera but the first, then of each board.
     """
 
     def __init__(self, boards: Boards, cameras: Mapping[str, Camera], poses: BoardPoses) -> None:
@@ -188,7 +190,7 @@ class _Adjustment:
         self._errors = self._residuals(self._transforms)
 
     def solve(self) -> None:
-        """Refine all poses, and estimate the covariances of the cameras."""
+        """Refine all poses by robust least squares; set ``T_world_cam`` and ``covariances``."""
         start = self._transforms
         num_unknowns = 6 * (len(start) - 1)
         ends = np.cumsum([0, *(2 * len(detection.points) for detection in self._sightings)])
@@ -228,7 +230,7 @@ class _Adjustment:
             self.covariances[number] = noise * whole[rows, rows]
 
     def _residuals(self, transforms: Transforms) -> list[Float[np.ndarray, "points 2"]]:
-        """Return the reprojection errors of every view, pixels."""
+        """Return the reprojection errors of each view in pixels; a view is a camera at a moment."""
         errors = []
         for (camera, moment), detection in zip(self._views, self._sightings, strict=True):
             T_world_board = transforms[self._num_cameras + moment]
@@ -241,18 +243,18 @@ class _Adjustment:
         return errors
 
     def outliers(self, limit_px: float) -> list[str]:
-        """Return the moments whose error is far above the median and above a limit, pixels."""
+        """Return the moments with an RMS error above ``limit_px`` and 3 times the median."""
         errors = self._rms([moment for _, moment in self._views], len(self._moments))
         limit = max(limit_px, OUTLIER * float(np.median(errors)))
         pairs = zip(self._moments, errors, strict=True)
         return [moment for moment, error in pairs if error > limit]
 
     def camera_errors_px(self) -> Float[np.ndarray, "cameras"]:
-        """Return the RMS reprojection error of every camera."""
+        """Return the RMS reprojection error of each camera, pixels."""
         return self._rms([camera for camera, _ in self._views], self._num_cameras)
 
     def _rms(self, groups: Sequence[int], count: int) -> Float[np.ndarray, "groups"]:
-        """Return the RMS reprojection error of each group of views, pixels."""
+        """Return the RMS reprojection error (pixels) by group; ``groups`` has each view's group."""
         squares = [float(np.square(error).sum()) for error in self._errors]
         points = [len(error) for error in self._errors]
         sums = np.bincount(groups, squares, count) / np.bincount(groups, points, count)

@@ -17,17 +17,17 @@ from dopepp.robot.calibration.board import Board
 MIN_POSES: Final = 4
 
 MAX_AMPLIFICATION: Final = 6.0
-"""Largest ratio of the tip's error to a pose's error: about 25° between the farthest poses."""
+"""Largest ratio of the tip's error to a pose's error; about 25° between the farthest poses."""
 
-MAX_RESIDUAL: Final = 0.002  # largest plausible residual, metres
+MAX_RESIDUAL: Final = 0.002  # largest distance of a touched point from the fit, metres
 
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """A tool's tip."""
+    """Position of a tool's tip on the robot's flange, and its errors."""
 
     position: Vector  # in the flange's frame, metres
-    residuals: Float[np.ndarray, "poses"]  # distance of the tip from the point, metres
+    residuals: Float[np.ndarray, "poses"]  # distance of the tip from the fixed point, metres
     deviations: Vector  # standard deviations of the position along the flange's axes, metres
     findings: tuple[str, ...]  # reasons not to trust the tip, with remedies
 
@@ -38,7 +38,7 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     The tip p (flange frame) and the point q (base frame) solve R_i p + t_i = q for all poses i.
 
     Args:
-        T_base_flange: Poses (R_i, t_i) of the flange, metres.
+        T_base_flange: Poses (R_i, t_i) of the flange in the robot's base frame, metres.
 
     Raises:
         UserError: There are fewer than four poses.
@@ -78,21 +78,21 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The plane of a bench with a frame on it."""
+    """Frame of a bench in the robot's base frame, with z normal to the bench, and its errors."""
 
-    T_base_bench: Transform  # z is the normal; from points: origin first, x to the second point
-    residuals: Float[np.ndarray, "points"]  # signed distances from the plane, metres
+    T_base_bench: Transform  # of touched points: origin at the first point, x to the second point
+    residuals: Float[np.ndarray, "points"]  # signed distances of points from the plane, metres
     findings: tuple[str, ...]  # reasons not to trust the plane, with remedies
 
 
 def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
-    """Fit the bench's plane to touched points.
+    """Fit a plane to points of the bench that a tool touched.
 
     Args:
-        touched: Points in the base's frame, metres. The base's z axis resolves the normal's sign.
+        touched: Points in the robot's base frame, metres. The normal points along the base's +z.
 
     Raises:
-        UserError: There are fewer than three points, or they lie on a line.
+        UserError: There are fewer than three points, or they almost lie on a line.
     """
     points = np.asarray(touched, np.float64)
     if len(points) < 3:
@@ -130,8 +130,8 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
     images.
 
     Args:
-        T_base_board: Pose of the board in the base frame, one per image.
-        board: The board.
+        T_base_board: Pose of the board in the robot's base frame in each image, metres.
+        board: The board that lies on the bench.
 
     Raises:
         UserError: There is no pose.
@@ -161,7 +161,7 @@ def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
 
 
 def axis_name(direction: Vector) -> str:
-    """Return the name of the nearest axis within 15°, otherwise the direction's numbers."""
+    """Return the name of the axis within 15° of ±``direction`` (unit vector), or its numbers."""
     k = int(np.abs(direction).argmax())
     if abs(direction[k]) > 0.966:
         return "xyz"[k] + " axis"
