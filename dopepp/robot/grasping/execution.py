@@ -1,4 +1,4 @@
-"""Execution of a plan in the simulation, and its outcome."""
+"""Execution of a grasp plan in the MuJoCo simulation, and its outcome."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from dopepp.robot.grasping.cell import JOINTS, STEP, Cell
 from dopepp.robot.grasping.planner import Gripper, Joints, Path, Plan
 
 SPEED: Final = 1.5  # average speed of the fastest joint over a motion, rad/s
-CLOSING_S: Final = 0.5  # duration of the ramp of the fingers' command, seconds
+CLOSING_S: Final = 0.5  # duration of the ramp of the gripper's command, seconds
 CLOSED: Final = 255.0  # command for zero width: the fingers press on a part of any width
 
 PAUSE_S: Final = 0.3
 SHAKE_S: Final = 1.2
 SHAKE_HZ: Final = 3.0
 SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])
-"""Amplitudes of the wrist's oscillation, radians: about 1 g at the part."""
+"""Amplitudes of the joints' oscillation, radians; the part is accelerated by about 1 g."""
 
 HELD_HEIGHT: Final = 0.05  # minimum rise of a part that counts as held, metres
 HIT_FORCE: Final = 5.0  # minimum contact force of a collision before the fingers close, newtons
@@ -32,22 +32,22 @@ FRAME_S: Final = 0.04  # interval of recorded states, seconds
 
 @dataclass
 class Outcome:
-    """Outcome of a motion."""
+    """Result of the arm's motions: held solid, collisions and recorded states."""
 
-    held: int | None = None  # number of the solid that was held after lifting and shaking
-    collided: bool = False  # whether the robot hit an obstacle before its fingers closed
+    held: int | None = None  # index of the solid that was held after lifting and shaking
+    collided: bool = False  # whether the robot hit bench or solid before the fingers closed
     times: list[float] = field(default_factory=list)  # time of each recorded state, seconds
     states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)  # qpos of MuJoCo
 
 
 class Execution:
-    """Executes a plan.
+    """Execution of the controller's motions in the simulation, with errors of the joint zeros.
 
     Args:
-        cell: The model.
-        state: The state of the simulation, which is modified.
-        gripper: The gripper's kinematics.
-        zero: True joints of the arm when its controller reads 0, radians.
+        cell: Model of the robot and the solids on the bench.
+        state: MuJoCo state of the cell, which is modified.
+        gripper: Kinematics of the gripper.
+        zero: True joint angles of the arm when its controller reads 0, radians.
     """
 
     def __init__(self, cell: Cell, state: Any, gripper: Gripper, zero: Joints) -> None:
@@ -56,21 +56,20 @@ class Execution:
         self.outcome = Outcome()
 
     def stand(self, joints: Joints) -> None:
-        """Set the arm to rest at joints that its controller reads, with open fingers."""
+        """Set the arm's pose without a motion; ``joints`` are the controller's angles, radians."""
         state = self._state
         state.qpos[:JOINTS] = state.ctrl[:JOINTS] = joints + self._zero
         state.qvel[: JOINTS + 8] = 0.0
         mujoco.mj_forward(self._cell.model, state)
 
     def wait(self, seconds: float) -> None:
-        """Simulate without a change of commands."""
+        """Simulate for ``seconds`` with constant commands to the servos."""
         mujoco.mj_step(self._cell.model, self._state, nstep=round(seconds / STEP))
 
     def run(self, plan: Plan) -> Outcome:
         """Execute a plan: approach, close the fingers, lift and shake.
 
-        Returns:
-            The outcome, with the number of the solid that is held after shaking, if any.
+        The solid that rises most counts as held if it rises by more than 5 cm (`HELD_HEIGHT`).
         """
         heights_before = self._heights()
         self._command = self._gripper.command(plan.opening)
@@ -90,23 +89,23 @@ class Execution:
         return self.outcome
 
     def move(self, path: Path) -> None:
-        """Move the arm along a path, from rest to rest."""
+        """Move the arm along a path of joint angles, from rest to rest, and record collisions."""
         for joints in _sample_path(path):
             self._advance(*joints)
             self.outcome.collided |= self._is_hit()
 
     def _heights(self) -> Float[np.ndarray, "solids"]:
-        """Return the height of every solid's origin, metres."""
+        """Return the height of each solid's origin above the bench, metres."""
         cell, state = self._cell, self._state
         return np.array([cell.pose(state, number)[2, 3] for number in range(cell.count)])
 
     def _rest(self, joints: Joints) -> None:
-        """Hold the arm at joints, radians, for a short pause."""
+        """Hold the arm at joint angles for :data:`PAUSE_S` seconds."""
         for _ in range(round(PAUSE_S / STEP)):
             self._advance(joints, np.zeros(JOINTS))
 
     def _advance(self, joints: Joints, speeds: Joints) -> None:
-        """Command joints and speeds for one simulation step, and record the state for films."""
+        """Simulate a step towards joint angles (radians) and speeds (rad/s); record the state."""
         state = self._state
         state.ctrl[:JOINTS] = joints + self._zero + LAG_S * speeds
         state.ctrl[JOINTS] = self._command
@@ -117,7 +116,7 @@ class Execution:
             self.outcome.states.append(state.qpos.copy())
 
     def _is_hit(self) -> bool:
-        """Return whether the robot presses on an obstacle with more than :data:`HIT_FORCE`."""
+        """Return whether the robot presses on bench or solid with more than 5 N (`HIT_FORCE`)."""
         state, force = self._state, np.zeros(6)
         pairs = self._cell.groups[state.contact.geom]
         for number in np.flatnonzero((pairs == 0).sum(axis=1) == 1):
@@ -128,7 +127,7 @@ class Execution:
 
 
 def _sample_path(path: Path) -> Iterator[tuple[Joints, Joints]]:
-    """Yield joints and their speeds at every simulation step, from rest to rest."""
+    """Yield joint angles and speeds along a path at each time step, from rest to rest."""
     lengths = np.abs(np.diff(path, axis=0)).max(axis=1)
     distances = np.concatenate([[0.0], np.cumsum(lengths)])
     count = round(max(float(distances[-1]) / SPEED, 0.4) / STEP)
@@ -140,7 +139,7 @@ def _sample_path(path: Path) -> Iterator[tuple[Joints, Joints]]:
 
 
 def _sample_shake(joints: Joints) -> Iterator[tuple[Joints, Joints]]:
-    """Yield joints and their speeds while the wrist oscillates."""
+    """Yield angles and speeds, at each time step, of an oscillation around ``joints``."""
     times = np.arange(0, SHAKE_S, STEP)
     fade = np.sin(np.pi * times / SHAKE_S) ** 0.5
     swings = (fade * np.sin(2 * np.pi * SHAKE_HZ * times))[:, None] * SHAKE

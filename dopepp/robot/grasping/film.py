@@ -1,4 +1,4 @@
-"""Films of trials: a video, a strip of images, a Rerun recording, and images of failures."""
+"""Films of grasp trials: a video, a strip of images, a Rerun recording, and images of failures."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ from dopepp.robot.grasping.workbench import has_gl, open_gl
 VIDEO_SIZE: Final = (640, 480)
 STRIDE: Final = 2  # recorded states per frame of a video
 STRIP: Final = (0.0, 0.3, 0.42, 0.53, 0.72, 1.0)
-"""Times of a strip's images, as shares of the motion."""
+"""Times of a strip's images, as shares of the motion's duration."""
 
 
 def show(
     task: GraspTask, records: Sequence[Record], folder: Path, video: Path | None, rerun: Path | None
 ) -> None:
-    """Write an image of each kind of failure, and the requested films of the first trial.
+    """Repeat trials with the task's first pose source, and write images and films of them.
 
-    The trials are repeated, because they depend on the seed alone.
+    ``folder`` receives a strip of images of the first trial with each kind of failure; ``video``
+    (.jpg: a strip) and ``rerun`` are films of the first trial.
     """
     first = task.sources[0]
     failed = [record for record in records if record.failure and record.source == first.name]
@@ -57,7 +58,7 @@ def show(
 
 
 class SideView:
-    """Renders the robot and the objects of a scene from the side; needs OpenGL."""
+    """Renderer of the robot and the objects of a scene from the side; needs OpenGL."""
 
     def __init__(self, scene: TrialScene) -> None:
         solids = [item.solid for item in scene.placed]
@@ -69,7 +70,7 @@ class SideView:
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.66, 155.0, -18.0
 
     def draw(self, positions: Any) -> RGBImage:
-        """Render a recorded state, given by MuJoCo's ``qpos``."""
+        """Render a recorded state from ``positions``, MuJoCo's ``qpos``."""
         self._state.qpos[:] = positions
         mujoco.mj_forward(self._cell.model, self._state)
         self._renderer.update_scene(self._state, self._camera)
@@ -77,7 +78,7 @@ class SideView:
 
 
 def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
-    """Return the camera's image with the estimated pose of the part."""
+    """Return the scene's camera image with a wireframe of the grasped part's estimated cuboid."""
     if attempt.estimate is None:
         return scene.image
     flange = trials.arm.flange(scene.joints)
@@ -88,7 +89,7 @@ def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBIma
 
 
 def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
-    """Return six images of a trial, the camera's first; without OpenGL, only the camera's."""
+    """Return the camera image and, with OpenGL, five side views of the motion, side by side."""
     states = attempt.outcome.states
     tiles = [Tile(draw_estimate(trials, scene, attempt))]
     if states and has_gl():
@@ -99,7 +100,7 @@ def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
 
 
 def write_video(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
-    """Write a video of a trial with the camera's image in a corner."""
+    """Write a video of a trial's motion from the side, with the camera image in a corner."""
     view, image = SideView(scene), draw_estimate(trials, scene, attempt)
     inset = cv2.resize(image, (213, 160), interpolation=cv2.INTER_AREA)
     outcome = attempt.outcome
@@ -137,7 +138,7 @@ def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
 
 
 def _log_shapes(recording: Any, model: Any) -> list[int]:
-    """Log the visible meshes and boxes of every body; return the bodies."""
+    """Log the visible meshes and boxes of a MuJoCo model to Rerun; return their bodies' ids."""
     import rerun as rr
 
     bodies = set()

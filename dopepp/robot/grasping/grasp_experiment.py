@@ -1,7 +1,7 @@
 """The grasp experiment: runs trials in several processes and reports them.
 
-Every trial depends only on the seed. The report consists of a JSON, a CSV and a Markdown file with
-Table 9 and the failures, and a curve.
+Each trial depends only on the seed and its number. The report consists of a JSON, a CSV and a
+Markdown file with Table 9 and the failures, and a plot of the success rate.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from dopepp.robot.grasping.workbench import LAYOUTS, RENDERERS, open_gl
 MAX_TRIALS: Final = 100_000
 
 CURVE: Final = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
-"""Errors of exact poses, each in millimetres and in degrees."""
+"""Errors that are added to exact poses, each in millimetres and in degrees."""
 
 PAPER: Final = ((49, 47), (46, 46), (47, 43), (46, 45))
-"""Table 9: recognised and caught of every 50 grasps with a real arm."""
+"""Table 9 of the paper: parts recognised and caught in 4 blocks of 50 grasps with a real arm."""
 
 SOURCES: Final[dict[str, tuple[PoseSource, ...]]] = {
     "network": (PoseSource(),),
@@ -55,14 +55,14 @@ SOURCES: Final[dict[str, tuple[PoseSource, ...]]] = {
     "true-matrices": (PoseSource(matrices="true"),),
     "curve": tuple(PoseSource("exact", error=(error, error)) for error in CURVE),
 }
-"""Sources of poses by their name on the command line."""
+"""Sources of the poses to grasp, by their name on the command line."""
 
 
 def parse_sources(text: str) -> tuple[PoseSource, ...]:
-    """Return the sources of a comma-separated list.
+    """Return the pose sources of a comma-separated list of names; repeated names count once.
 
     Raises:
-        UserError: A name is unknown.
+        UserError: A name is not in :data:`SOURCES`.
     """
     names = dict.fromkeys(name.strip() for name in text.split(","))
     for name in names:
@@ -71,7 +71,7 @@ def parse_sources(text: str) -> tuple[PoseSource, ...]:
 
 
 def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
-    """Check the options of a task before the trials start, and set ``sources`` and ``network``.
+    """Check the options of an experiment before its trials start, and set its pose sources.
 
     Args:
         task: Options from the command line.
@@ -79,10 +79,10 @@ def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
         count: Number of trials.
 
     Returns:
-        The task with its sources of poses; ``network`` is None if no source needs a network.
+        The task with its ``sources``; ``network`` is None if no source needs a network.
 
     Raises:
-        UserError: An option has an invalid value, or the part has no network or no grasp.
+        UserError: An option has an invalid value, or the part has no checkpoint or no grasps.
     """
     check_choice("--layout", task.layout, LAYOUTS)
     check_choice("--renderer", task.renderer, RENDERERS)
@@ -114,19 +114,19 @@ def make_experiment(
     rerun: Path | None,
     report_progress: Callable[[str], object],
 ) -> str:
-    """Run trials and write their report and images.
+    """Run grasp trials; write their report, and images of failures, to a folder.
 
     Args:
-        task: A task from :func:`check_task`.
-        count: Number of trials.
-        workers: Number of processes (default: all cores).
+        task: Options from :func:`check_task`.
+        count: Number of trials with each source of poses.
+        workers: Number of processes (default: one per core).
         folder: Target folder.
         video: Film of the first trial, .mp4 or .jpg.
         rerun: Rerun recording of the first trial.
         report_progress: Receives a line of text after every 50 trials.
 
     Returns:
-        The tables in Markdown.
+        The report in Markdown.
 
     Raises:
         UserError: A file cannot be written, an image cannot be rendered, or no grasp is reachable.
@@ -136,7 +136,7 @@ def make_experiment(
         if path is not None:
             check_target(path, suffixes)
     if video is not None or task.renderer == "mujoco":
-        open_gl(Cell(shown="solids").model, SIZE).close()  # fails now, not after all trials
+        open_gl(Cell(shown="solids").model, SIZE).close()  # fail now, not after all trials
     start, records = time.monotonic(), []
     for record in run_trials(task, count, workers or available_cores()):
         records.append(record)
@@ -156,7 +156,7 @@ def make_experiment(
 
 
 def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[str, object]:
-    """Return the settings and totals at the top of a report."""
+    """Return the settings, largest hand-eye errors and duration for the top of the report."""
     worst_shift_mm = max(record.hand_eye_mm for record in records)
     worst_turn_deg = max(record.hand_eye_deg for record in records)
     return {
@@ -175,11 +175,11 @@ def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[s
 
 
 def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
-    """Run trials and yield their records as they are done.
+    """Run trials in ``workers`` processes; yield one record per source when a trial is done.
 
     Raises:
         RunError: A process died.
-        UserError: A trial cannot run the task.
+        UserError: The options do not suit a trial, e.g. the arm does not reach the tray.
     """
     run = partial(_run_trial, task)
     if workers == 1:
@@ -195,7 +195,7 @@ def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
 
 
 def _run_trial(task: GraspTask, number: int) -> list[Record]:
-    """Run a trial with every source of the task."""
+    """Return the records of trial ``number`` with each pose source of the task."""
     trials = _task_trials(task)
     scene = trials.scene(number)
     return [trials.attempt(scene, source).record for source in task.sources]
@@ -203,38 +203,38 @@ def _run_trial(task: GraspTask, number: int) -> list[Record]:
 
 @lru_cache(maxsize=1)
 def _task_trials(task: GraspTask) -> Trials:
-    """Set up the trials of a task, once in each process."""
+    """Return the trials of a task; the models are loaded once in each process."""
     return Trials(task)
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Successes among trials."""
+    """Numbers of trials, of recognised parts (ADD below a tenth of the diameter) and of catches."""
 
     trials: int
     recognised: int
     caught: int
 
     def interval(self, count: int) -> tuple[float, float]:
-        """Return the 95 % Wilson interval of a count divided by the number of trials."""
+        """Return the bounds of the 95 % Wilson interval of ``count / trials``, 0 to 1."""
         from dopepp.metrics.functional import wilson_interval  # imports torch
 
         return wilson_interval(count, self.trials)
 
     def rate(self, count: int) -> str:
-        """Return a count as a share with its interval."""
+        """Return ``count / trials`` and its 95 % interval as text, percent."""
         low, high = self.interval(count)
         return f"{100 * count / self.trials:.1f} % ({100 * low:.1f} – {100 * high:.1f})"
 
 
 def count_records(records: Sequence[Record]) -> Counts:
-    """Count the successes among trials."""
+    """Count the trials with a recognised part and with a caught part."""
     recognised = sum(record.recognised for record in records)
     return Counts(len(records), recognised, sum(record.caught for record in records))
 
 
 def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Group records by their source of poses, and sort each group by trial."""
+    """Group records by name of their pose source, and sort each group by number of the trial."""
     groups: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda record: record.number):
         groups.setdefault(record.source, []).append(record)
@@ -242,7 +242,7 @@ def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def table_9(records: Sequence[Record]) -> list[str]:
-    """Return the Markdown lines of a source's trials in the layout of the paper's Table 9."""
+    """Return Markdown lines of the paper's Table 9 (a row per 50 trials) for one pose source."""
     lines = [
         "| grasps | recognised | caught | paper: recognised | caught |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -263,7 +263,7 @@ def table_9(records: Sequence[Record]) -> list[str]:
 
 
 def sources_table(records: Sequence[Record]) -> list[str]:
-    """Return the Markdown lines of a table with a row for every source of poses."""
+    """Return Markdown lines of a table of success rates and failures, a row per pose source."""
     lines = [
         "| poses | trials | recognised (ADD-0.1d) | caught | median error at the arm "
         f"| {' | '.join(FAILURES)} |",
@@ -283,7 +283,7 @@ def sources_table(records: Sequence[Record]) -> list[str]:
 
 
 def markdown(records: Sequence[Record], facts: Mapping[str, Any]) -> str:
-    """Return the report in Markdown."""
+    """Return the report in Markdown; ``facts`` are listed at its top."""
     first = next(iter(by_source(records).values()))
     listed = [f"- {name}: {value}" for name, value in facts.items() if value is not None]
     tables = {
@@ -297,7 +297,7 @@ def markdown(records: Sequence[Record], facts: Mapping[str, Any]) -> str:
 
 
 def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, Any]) -> None:
-    """Write ``grasps.csv``, ``grasps.json``, ``grasps.md`` and, for a curve, ``curve.png``."""
+    """Write ``grasps.csv``, ``.json``, ``.md`` and, if poses have added errors, ``curve.png``."""
     groups = by_source(records)
     rows = [asdict(record) for group in groups.values() for record in group]
     write_csv(folder / "grasps.csv", rows)
@@ -316,7 +316,7 @@ def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, An
 
 
 def curve(records: Sequence[Record]) -> Any:
-    """Plot the share of caught parts against the error of exact poses."""
+    """Plot the share of caught parts against the error added to exact poses; return the figure."""
     from dopepp.drawing.curves import RateCurve, rates_figure
 
     points = []
@@ -331,7 +331,7 @@ def curve(records: Sequence[Record]) -> Any:
 
 
 def _summary(rows: Sequence[Record]) -> dict[str, Any]:
-    """Return the counts, their intervals and the numbers of failures."""
+    """Return the counts of trials, their intervals and the number of each kind of failure."""
     total = count_records(rows)
     return {
         **asdict(total),

@@ -1,6 +1,6 @@
 """A trial: an image of the bench, an estimated pose, a motion of the arm, and its outcome.
 
-A task and the records of its trials are plain values that can be pickled for worker processes.
+A task and the records of its trials can be pickled for worker processes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 AnyDetection = TypeVar("AnyDetection", "Detection", "WorldDetection")
 
-BLOCK: Final = 50  # trials with one calibration, as in Table 9
+BLOCK: Final = 50  # number of successive trials with one calibration, as in the paper's Table 9
 EXACT: Final = "exact poses"
 FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
 
@@ -69,7 +69,7 @@ RECOGNISED: Final = 0.1  # largest ADD of a recognised part, as a share of its d
 
 @dataclass(frozen=True)
 class PoseSource:
-    """Source of the poses from which grasps are planned."""
+    """Method by which the controller obtains the poses of the parts to grasp."""
 
     kind: str = "network"  # `network`, `templates`, `exact` (the simulation's) or `random`
     matrices: str = "calibrated"  # `calibrated` or `true` camera matrices for the network's poses
@@ -78,7 +78,7 @@ class PoseSource:
 
     @property
     def name(self) -> str:
-        """Name in reports."""
+        """Name of the source in reports, with its errors if any."""
         if any(self.error):
             return f"{EXACT}, off by {self.error[0]:g} mm and {self.error[1]:g}°"
         true = ", true matrices" if self.matrices == "true" else ""
@@ -87,7 +87,7 @@ class PoseSource:
 
 @dataclass(frozen=True)
 class GraspTask:
-    """Options of an experiment."""
+    """Options of a grasp experiment."""
 
     part: str = "pivconnector"  # a built-in part or a mesh file
     unit: str | None = None  # length unit of the mesh file
@@ -96,22 +96,22 @@ class GraspTask:
     refine: bool = True  # whether the network's poses are refined
     layout: str = "single"  # arrangement of parts, one of `LAYOUTS`
     renderer: str = "raster"  # one of `RENDERERS`
-    yaw_deg: float = 180.0  # largest rotation of parts to either side
-    rest: str = "front"  # faces that point upwards; see `Layout`
+    yaw_deg: float = 180.0  # largest rotation of parts about the vertical, to either side
+    rest: str = "front"  # face that points upwards, `front` or `any`; see `Layout`
     seed: int = 0
-    views: int = 1  # images of the network or templates, 1 or 2
+    views: int = 1  # number of images from which poses are estimated, 1 or 2
     sources: tuple[PoseSource, ...] = (PoseSource(),)
 
 
 @dataclass(frozen=True)
 class Record:
-    """Result of a trial with one source of poses."""
+    """Result of a grasp trial with one pose source."""
 
     number: int  # index of the trial, from 0; equal indices have equal scenes
-    source: str  # name of the source
-    off: float  # deliberate error of the pose, millimetres and degrees
-    seen: bool  # whether there was a pose
-    recognised: bool  # whether ADD was below a tenth of the diameter
+    source: str  # name of the pose source
+    off: float  # error added to an exact pose, millimetres and degrees
+    seen: bool  # whether the pose source returned a pose
+    recognised: bool  # whether ADD was below a tenth of the part's diameter
     # Errors are in the arm's base frame, include calibration errors, and are measured before the
     # pose is aligned with the bench. Without a pose, errors are NaN.
     add_mm: float  # ADD, millimetres
@@ -119,46 +119,46 @@ class Record:
     error_deg: float  # rotation error of the pose, degrees
     caught: bool  # whether the gripper held the part after lifting and shaking
     failure: str  # one of `FAILURES`, or empty
-    hand_eye_mm: float  # error of the hand-eye calibration at the part's distance
+    hand_eye_mm: float  # position error by the hand-eye calibration at the parts' distance
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
     second_view: str = ""  # where the camera took a second image, and the reason
 
 
 @dataclass(frozen=True, eq=False)
 class SceneObservation:
-    """Result of the controller's observation of a scene."""
+    """Poses of the parts that the controller obtained, and the arm's joints at the last image."""
 
-    poses: list[Transform]  # T_base_obj of the parts, the highest first
+    poses: list[Transform]  # T_base_obj of the parts, sorted by descending height
     joints: Joints  # joints of the arm at the last image, radians
     second_view: str = ""  # as in :class:`Record`
 
 
 @dataclass(frozen=True, eq=False)
 class TrialScene:
-    """The scene of a trial before the grasp."""
+    """The objects, the robot and the camera image of a trial before the grasp."""
 
-    number: int
+    number: int  # index of the trial
     cell: Cell
-    placed: Sequence[PlacedSolid]  # the parts first
-    start: Any  # state of the simulation
+    placed: Sequence[PlacedSolid]  # objects before they settle, the parts first
+    start: Any  # state of the MuJoCo simulation before the grasp
     poses: list[Transform]  # T_base_obj of every object at rest
     robot: TrueRobot
     calibrated: CalibratedRobot
     joints: Joints  # measured joint angles at the time of the image, radians
     T_base_cam: Transform  # the true pose of the camera
     image: RGBImage
-    photograph: Photographer  # takes further images
+    photograph: Photographer  # renders images of the scene from other camera poses
 
     @property
     def targets(self) -> list[Transform]:
-        """Poses of the parts, the highest first."""
+        """True poses T_base_obj of the parts at rest, sorted by descending height."""
         placed = zip(self.placed, self.poses, strict=True)
         return sorted((pose for item, pose in placed if item.body.part), key=_height, reverse=True)
 
 
 @dataclass(eq=False)
 class Attempt:
-    """The record and the motion of a trial with one source of poses."""
+    """The record, the motion and the used pose of a trial with one pose source."""
 
     record: Record
     outcome: Outcome = field(default_factory=Outcome)
@@ -166,7 +166,7 @@ class Attempt:
 
 
 class Trials:
-    """Runs the trials of a task. Trial i depends only on the task's seed and i."""
+    """The trials of a task, by number. Trial i depends only on the task's options, seed and i."""
 
     def __init__(self, task: GraspTask) -> None:
         self.task, self.part = task, load_part(task.part, task.unit)
@@ -184,7 +184,7 @@ class Trials:
 
     @cached_property
     def estimator(self) -> PoseEstimator:
-        """The network."""
+        """The task's network, with refinement if the task asks for it."""
         from dopepp.inference.estimator import PoseEstimator
 
         assert self.task.network is not None
@@ -193,7 +193,7 @@ class Trials:
 
     @cached_property
     def templates(self) -> PoseEstimator:
-        """Estimator that detects the part by templates of its mesh, without training."""
+        """Estimator that compares the image with templates of the part's mesh, without training."""
         from dopepp.inference.estimator import PoseEstimator
 
         near, far = self.distance
@@ -203,7 +203,7 @@ class Trials:
         return PoseEstimator.from_mesh(self.task.part, self.task.unit, distances, tilt_deg)
 
     def _trained_distance(self) -> tuple[float, float]:
-        """Return distances inside the network's training range, metres."""
+        """Return the range of camera distances: 40 to 75 % of the network's range, metres."""
         names = [part.name for part in self.estimator.parts]
         if self.part.name not in names:
             problem = f"--network {self.task.network}, which was not trained on {self.part.name}"
@@ -216,13 +216,13 @@ class Trials:
         return near + 0.4 * (far - near), near + 0.75 * (far - near)
 
     def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
-        """Sample the true robot of a block of trials, and calibrate it."""
+        """Sample the errors of the robot for a block of :data:`BLOCK` trials, and calibrate it."""
         rng = np.random.default_rng([self.task.seed, block, 1])
         robot = draw_robot(rng, self.tip)
         return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
 
     def scene(self, number: int) -> TrialScene:
-        """Set up a trial and take its image."""
+        """Sample the objects and the camera pose of a trial, and render the objects at rest."""
         rng = np.random.default_rng([self.task.seed, number])
         robot, calibrated = self.robot(number // BLOCK)
         placed = self.layout.draw(rng)
@@ -246,7 +246,7 @@ class Trials:
         return TrialScene(number, cell, placed, state, poses, robot, calibrated, *camera)
 
     def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
-        """Grasp a part of a scene, using the poses of a source."""
+        """Grasp the highest part for which a motion is found, at the poses from a source."""
         observation = self._observe(scene, source)
         if not observation.poses:
             return Attempt(self._record(scene, source, observation, None, None))
@@ -267,12 +267,11 @@ class Trials:
         return Attempt(record, outcome or Outcome(), estimate)
 
     def _planner(self, scene: TrialScene) -> Planner:
-        """Return the planner of grasps among the parts of a scene."""
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
-        """Return the poses of parts as the controller estimates them, from one image or two."""
+        """Return the poses of the parts from a source, which takes one or two images if needed."""
         rng = np.random.default_rng([self.task.seed, scene.number, 2])
         if source.kind == "random":
             return SceneObservation([self.layout.draw_pose(rng)], scene.joints)
@@ -301,18 +300,18 @@ class Trials:
         return SceneObservation(sorted(poses, key=_height, reverse=True), joints, reason)
 
     def _likely(self, detections: Sequence[AnyDetection]) -> list[AnyDetection]:
-        """Return the detections of the part with at least half the best score."""
+        """Return the part's detections with at least half the score of its best detection."""
         parts = [detection for detection in detections if detection.object == self.part.name]
         return [part for part in parts if part.score >= parts[0].score / 2]
 
     def _camera_pose(self, scene: TrialScene, source: PoseSource, joints: Joints) -> Transform:
-        """Return T_base_cam for the controller."""
+        """Return T_base_cam by the calibration or, if the source asks for it, the true pose."""
         if source.matrices == "true":
             return self._true_camera_pose(scene.robot, joints)
         return np.asarray(self.arm.flange(joints) @ scene.calibrated.knowledge.T_flange_cam)
 
     def _true_camera_pose(self, robot: TrueRobot, joints: Joints) -> Transform:
-        """Return T_base_cam of the real robot, for joints that its controller reads."""
+        """Return T_base_cam of the true robot at the joint angles that its controller reads."""
         return np.asarray(self.arm.flange(joints + robot.zero) @ robot.T_flange_cam)
 
     def _record(
@@ -323,7 +322,7 @@ class Trials:
         estimate: Transform | None,
         outcome: Outcome | None,
     ) -> Record:
-        """Return the result of a trial."""
+        """Return the result of a trial; ``outcome`` is None if no plan was found."""
         robot = scene.calibrated
         ends = (robot.hand_eye_mm, robot.hand_eye_deg, observation.second_view)
         trial = (scene.number, source.name, source.error[0])
@@ -349,7 +348,7 @@ class Trials:
         return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends)
 
     def _add(self, estimate: Transform, target: Transform) -> float:
-        """Return the ADD to the nearest symmetric pose, metres."""
+        """Return the smallest ADD over the part's symmetries, metres."""
         points = transform(estimate, self.part.points)
         return min(
             float(np.linalg.norm(points - transform(target @ S, self.part.points), axis=1).mean())
@@ -357,7 +356,7 @@ class Trials:
         )
 
     def _aim_camera(self, robot: TrueRobot, rng: Generator) -> tuple[Joints, Transform]:
-        """Sample joints at which the camera sees the tray; return joints and T_base_cam."""
+        """Sample a camera pose above the tray; return the measured joints and true T_base_cam."""
         for _ in range(20):
             point = TRAY + np.array([*rng.uniform(-0.01, 0.01, 2), 0.0])
             distance = rng.uniform(*self.distance)
@@ -375,12 +374,11 @@ class Trials:
 
 
 def _height(T_base_obj: Transform) -> float:
-    """Return the height of a pose's origin, metres."""
     return float(T_base_obj[2, 3])
 
 
 def _perturb(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:
-    """Return a pose with an error in millimetres and degrees."""
+    """Return a pose with errors (mm, °) in a random direction and about a random axis."""
     direction, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     R = Rotation.from_rotvec(np.radians(error[1]) * axis).as_matrix()
     return make_transform(R @ pose[:3, :3], pose[:3, 3] + 0.001 * error[0] * direction)

@@ -12,9 +12,9 @@ between the fingers, all in the part's frame and metres.
 
 :func:`propose_grasps` samples points of the surface and pairs them with the points behind them
 along the normal. Pairs with opposite normals within the pads' friction are antipodal (Nguyen 1988).
-Each pair is tested on every face on which the part can lie: the approach is from above, and the
-volumes of fingers and palm must be free. The score prefers large contact areas under both pads and
-points close to the centre of mass.
+Pairs are tested on the faces on which the part can lie: the approach is from above, and the volumes
+of fingers and palm must be free. The score prefers large contact areas under both pads and points
+close to the centre of mass.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ obstacle."""
 ABOVE_BENCH: Final = 0.001  # smallest distance of the pads' ends from the bench, metres
 PAIRS: Final = 1500  # sampled points for the search of pairs
 FACES: Final = 8  # number of the most common resting faces
-TRIED: Final = 100  # pairs tested on every face
+TRIED: Final = 100  # largest number of pairs that are tested on a face
 SAMPLES: Final = 5000  # points that represent the surface in tests of collisions and contacts
 THINNEST: Final = 0.002  # smallest width of a grasp, metres
 FRICTION_ANGLE: Final = math.radians(15.0)
@@ -60,17 +60,17 @@ STEEPEST_CLOSING: Final = math.sin(math.radians(37.0))
 """Largest vertical component of a closing direction."""
 
 TILTS: Final = np.radians([0.0, 25.0, -25.0])
-"""Tilts of an approach from straight down, about the closing direction."""
+"""Tilts of an approach from straight down, about the closing direction, radians."""
 
 ENOUGH: Final = 80e-6  # contact area of a pad for the full score (a fifth of the pad), m²
 LEAST: Final = 12e-6  # smallest contact area of each pad, m²
 FINGER: Final = 0.025  # thickness of a finger behind its pad, metres
 PALM: Final = np.array([[-0.075, -0.04, -0.16], [0.075, 0.04, -0.055]])
-"""Corners of the gripper's body, in the frame of the pads' ends, metres."""
+"""Opposite corners of the gripper body's box, tool axes, relative to the pads' ends, metres."""
 
 FLAT: Final = math.cos(FRICTION_ANGLE)
 APART: Final = (0.008, math.radians(20.0))
-"""Smallest distance, metres, and angle between distinct grasps of a face."""
+"""Smallest distance (metres) or angle (radians) between distinct grasps of a face."""
 
 _BUILT_IN: Final = Path(__file__).parent / "data"
 Points = Float[np.ndarray, "n 3"]
@@ -80,29 +80,29 @@ FIX: Final = "correct the file, or create a new file with `dopepp grasp propose`
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """A two-finger grasp of a part, with the fields described in the module."""
+    """A two-finger grasp in a part's frame."""
 
-    point: Vector
-    closing: Vector
-    approach: Vector
-    width: float
+    point: Vector  # midpoint between the fingers, metres
+    closing: Vector  # direction of the fingers' closing, unit vector
+    approach: Vector  # direction of the gripper's motion to the part, unit vector
+    width: float  # width of the part between the fingers, metres
 
     @property
     def opening(self) -> float:
-        """Distance between the approaching fingers, metres."""
+        """Distance between the fingers during the approach: width plus clearance, metres."""
         return min(self.width + 2 * CLEARANCE, WIDEST)
 
     def T_obj_tool(self, flipped: bool) -> Transform:  # noqa: N802
-        """Return the tool's pose with x = closing, z = approach; ``flipped`` by 180° about z."""
+        """Return the tool's pose: origin point, z approach, x closing (−closing if flipped)."""
         x, z = -self.closing if flipped else self.closing, self.approach
         return make_transform(np.stack([x, np.cross(z, x), z], axis=1), self.point)
 
 
 def find_grasps(part: Part, path: Path | None = None) -> tuple[Grasp, ...]:
-    """Return a part's grasps from a file (default: the built-in part's).
+    """Return a part's grasps, best first, from a file (default: the file of a built-in part).
 
     Raises:
-        UserError: The file is invalid or of another part, or the part is not built in.
+        UserError: The file is invalid or of another part, or the part has no built-in file.
     """
     built_in = _BUILT_IN / f"{part.name}.yaml"
     if path is None and not built_in.is_file():
@@ -134,7 +134,7 @@ class _GraspFile:
 
 
 def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
-    """Read a file of grasps.
+    """Read a YAML file of grasps.
 
     Raises:
         UserError: The file is invalid, or of another part.
@@ -152,7 +152,7 @@ def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
 
 
 def _check_grasp(record: _GraspRecord, name: str, part: Part) -> Grasp:
-    """Return the grasp of a file's record after checking its position and directions."""
+    """Return a record's grasp; reject a point off the part and directions that are not square."""
     point, closing, approach = map(np.array, (record.point, record.closing, record.approach))
     lower, upper = part.cuboid.min(axis=0) - 0.01, part.cuboid.max(axis=0) + 0.01
     if not ((point >= lower) & (point <= upper)).all():
@@ -167,7 +167,7 @@ def _check_grasp(record: _GraspRecord, name: str, part: Part) -> Grasp:
 
 
 def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
-    """Write a file of grasps, one per line."""
+    """Write grasps to a YAML file, one per line."""
     check_target(path, (".yaml", ".yml"))
     lines = [f"part: {part.name}", "grasps:"]
     for grasp in grasps:
@@ -186,15 +186,15 @@ def _format_number(value: float) -> str:
 
 
 def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
-    """Propose grasps of a part.
+    """Propose grasps from above for the stable faces on which a part can rest.
 
     Args:
         part: A part with a mesh.
         count: Maximum number of grasps.
-        seed: Random seed.
+        seed: Random seed of the sampled surface points.
 
     Returns:
-        Grasps for the most common resting face first.
+        Grasps by resting face, the most common face first; of each face, the best grasp first.
 
     Raises:
         UserError: The part has no mesh, or no grasp was found.
@@ -233,7 +233,7 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
 def _sample_surface(
     mesh: Mesh, count: int, rng: np.random.Generator
 ) -> tuple[Points, Points, float]:
-    """Return random points of the surface, their normals, and the area per point, m²."""
+    """Return ``count`` uniform random surface points, their unit normals, and m² per point."""
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1) / 2
@@ -245,7 +245,7 @@ def _sample_surface(
 
 
 def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vector, float]]:
-    """Yield midpoints, closing directions and widths of antipodal pairs."""
+    """Yield midpoint, closing direction and width (metres) of antipodal pairs of surface points."""
     points, normals, _ = _sample_surface(mesh, PAIRS, rng)
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     flat = np.cross(b - a, c - a)
@@ -261,7 +261,7 @@ def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vecto
 def _hits(
     origin: Vector, direction: Vector, a: Points, b: Points, c: Points
 ) -> Float[np.ndarray, "hits"]:
-    """Return the depths at which a ray hits triangles (Möller and Trumbore 1997)."""
+    """Return a ray's distances to triangles (a, b, c) that it hits (Möller and Trumbore 1997)."""
     side, other = b - a, c - a
     across = np.cross(direction, other)
     scale = np.einsum("ij,ij->i", side, across)
@@ -276,7 +276,7 @@ def _hits(
 
 
 def _from_above(middle: Vector, closing: Vector, width: float, up: Vector) -> Iterator[Grasp]:
-    """Yield grasps of a pair with approaches close to straight down."""
+    """Yield a grasp for each of :data:`TILTS`, the approach's tilt from the steepest direction."""
     down = -up + (up @ closing) * closing
     down /= np.linalg.norm(down)
     aside = np.cross(closing, down)
@@ -292,7 +292,11 @@ def _score(
     centre: Vector,
     diameter: float,
 ) -> float:
-    """Return the score of a grasp while ``up`` points upwards; 0 for an impossible grasp."""
+    """Return a grasp's score (at most 1), or 0 if the gripper collides or has too little contact.
+
+    ``up`` points upwards in the part's frame, ``bottom`` is the bench's height along it (metres),
+    ``surface`` comes from :func:`_sample_surface`, and ``centre`` is the centre of mass.
+    """
     points, normals, area = surface
     T = grasp.T_obj_tool(flipped=False)
     half = grasp.width / 2
@@ -323,10 +327,7 @@ def _score(
 
 
 def _select_distinct(scored: list[tuple[float, Grasp]], count: int) -> list[Grasp]:
-    """Return at most ``count`` grasps of (score, grasp) pairs, the best first.
-
-    A grasp is omitted if a better grasp is within :data:`APART` of its position and directions.
-    """
+    """Return the ``count`` best grasps, without those within :data:`APART` of a better grasp."""
     distance, cosine = APART[0], math.cos(APART[1])
     distinct: list[Grasp] = []
     for _, grasp in sorted(scored, key=lambda pair: -pair[0]):

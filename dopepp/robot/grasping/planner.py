@@ -1,7 +1,7 @@
 """Planning of a grasp from a part's estimated pose, as in a robot's controller.
 
 The planner uses estimated poses, calibrated matrices and the robot's model, never the simulation's
-truth. Paths are checked for collisions in a separate model with the parts at their estimated poses.
+true poses. Collisions are checked in a separate model with the parts at their estimated poses.
 Inverse kinematics (by mink) takes differential steps within the joints' limits.
 """
 
@@ -26,13 +26,13 @@ from dopepp.virtual.body import Hull
 Joints = Float[np.ndarray, "6"]
 """Angles of the arm's joints, radians."""
 
-Path = Float[np.ndarray, "waypoints 6"]
+Path = Float[np.ndarray, "waypoints 6"]  # joint angles, radians
 
 POSITION_TOLERANCE: Final = 1e-4  # metres
 ANGLE_TOLERANCE: Final = 1e-3  # radians
 STEPS: Final = 60  # iterations of inverse kinematics; a reachable pose needs about ten
 COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # gripper commands, open to closed
-LOW: Final = 0.005  # largest height error of a part that lies on the bench, metres
+LOW: Final = 0.005  # largest estimated height above the bench of a part that lies on it, metres
 
 STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
 RETREAT: Final = 0.06  # length of the straight descent, metres
@@ -42,7 +42,7 @@ PENETRATION: Final = 1e-4  # minimum penetration of a collision, metres
 
 
 class Arm:
-    """Kinematics of the arm's model, without the errors of a real arm."""
+    """Forward and inverse kinematics of the arm's model, without the errors of a real arm."""
 
     def __init__(self) -> None:
         self._cell = Cell(gripper=False)
@@ -51,19 +51,14 @@ class Arm:
         self._limits = [mink.ConfigurationLimit(self._cell.model)]
 
     def flange(self, joints: Joints) -> Transform:
-        """Return T_base_flange."""
+        """Return T_base_flange at joint angles, metres."""
         self._configuration.update(joints)
         return self._cell.flange_pose(self._configuration.data)
 
     def joints(self, T_base_flange: Transform, near: Joints = HOME) -> Joints | None:
-        """Solve the inverse kinematics.
+        """Return joint angles at which the flange is at a pose, or None if none are found.
 
-        Args:
-            T_base_flange: Pose of the flange.
-            near: Initial joints.
-
-        Returns:
-            The joints, or None if the pose is out of reach.
+        The search takes at most :data:`STEPS` steps from ``near``, within the joints' limits.
         """
         self._configuration.update(np.array(near))
         self._task.set_target(mink.SE3.from_matrix(T_base_flange))
@@ -77,7 +72,7 @@ class Arm:
         return None
 
     def _has_reached(self, T_base_flange: Transform) -> bool:
-        """Return whether the current joints reach a pose within the tolerances."""
+        """Return whether the flange is within 0.1 mm and 1 mrad of a pose at the current joints."""
         current = self._cell.flange_pose(self._configuration.data)
         shift = np.linalg.norm(current[:3, 3] - T_base_flange[:3, 3])
         angle = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
@@ -86,7 +81,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Gripper:
-    """Kinematics of the fingers, at every command of :data:`COMMANDS`."""
+    """Kinematics of the gripper's fingers, tabulated by :data:`COMMANDS`."""
 
     widths: Float[np.ndarray, "commands"]  # distance between the pads, metres, descending
     # Distance of the pads' ends from the flange, metres. Closing fingers swing forward.
@@ -99,21 +94,21 @@ class Gripper:
         return float(self.widths[0])
 
     def command(self, width: float) -> float:
-        """Return the command that opens the pads to a width, metres."""
+        """Return the command (0 open, 255 closed) at which the pads are ``width`` metres apart."""
         return float(np.interp(-width, -self.widths, COMMANDS))
 
     def reach(self, width: float) -> float:
-        """Return the distance of the pads' ends from the flange at a width, metres."""
+        """Return the distance from flange to pads' ends while the pads are ``width`` apart, m."""
         return float(np.interp(-width, -self.widths, self.reaches))
 
     def fingers(self, width: float) -> Float[np.ndarray, "8"]:
-        """Return the finger joints that open the pads to a width, metres."""
+        """Return MuJoCo's finger joint angles, rad, while the pads are ``width`` metres apart."""
         command = self.command(width)
         return np.array([np.interp(command, COMMANDS, joint) for joint in self.joints.T])
 
 
 def measure_gripper() -> Gripper:
-    """Measure the pads' positions in a simulation of the closing fingers."""
+    """Measure the gripper's kinematics in a simulation of the closing fingers."""
     cell = Cell()
     state = cell.data()
     widths, reaches, joints = [], [], []
@@ -132,34 +127,30 @@ def measure_gripper() -> Gripper:
 
 @dataclass(frozen=True, eq=False)
 class ControllerParameters:
-    """Calibrated parameters of the controller."""
+    """Calibrated poses of camera, tool tip and bench that the robot's controller uses."""
 
     T_flange_cam: Transform
     tip: Vector  # midpoint between the ends of the closed fingers, flange frame, metres
-    T_base_bench: Transform  # z is the bench's normal
+    T_base_bench: Transform  # z is the bench's upward normal
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A motion: waypoints of the joints, radians."""
+    """Arm motion of a grasp: joint angles at the waypoints of its three phases."""
 
-    approach: Path  # from the start to above the part
-    descent: Path  # straight down to the part
-    lift: Path  # straight up
+    approach: Path  # from the start to :data:`RETREAT` before the grasp
+    descent: Path  # along the grasp's approach direction to the part
+    lift: Path  # along the bench's normal
     opening: float  # distance between the fingers before they close, metres
-    grasp: Grasp  # the part's grasp that the motion executes
+    grasp: Grasp  # grasp that the motion executes
 
 
 def align_with_bench(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
-    """Lay the estimated pose of a part flat on the bench.
+    """Rotate and move an estimated pose so that the part's lowest stable face lies on the bench.
 
-    An image from above determines tilt and height poorly; the bench determines both well. A part
-    whose height differs by more than :data:`LOW` leans on an obstacle, so its pose is unchanged.
-
-    Args:
-        T_base_obj: The estimated pose.
-        hull: Convex hull of the part.
-        T_base_bench: Pose of the bench.
+    An image from above determines tilt and height poorly; the bench determines both well. If the
+    lowest point is over :data:`LOW` metres above or below the bench after the rotation, the part
+    leans on another object, and its pose is returned unchanged.
     """
     up = T_base_bench[:3, 2]
     normals = hull.rests[0] @ T_base_obj[:3, :3].T
@@ -178,13 +169,13 @@ def align_with_bench(T_base_obj: Transform, hull: Hull, T_base_bench: Transform)
 
 
 class Planner:
-    """Plans grasps.
+    """Planner of collision-free arm motions for grasps.
 
     Args:
-        arm: The arm's kinematics.
-        gripper: The gripper's kinematics.
-        cell: A model with the largest possible number of parts.
-        knowledge: Calibrated parameters of the controller.
+        arm: Kinematics of the arm.
+        gripper: Kinematics of the gripper.
+        cell: Model for collision checks, with at least as many parts as the plans consider.
+        knowledge: Calibrated poses of the camera, the tool tip and the bench.
     """
 
     def __init__(
@@ -198,15 +189,15 @@ class Planner:
     def plan(
         self, poses: Sequence[Transform], grasps: Sequence[Grasp], start: Joints
     ) -> Plan | None:
-        """Plan a motion that grasps one of the poses.
+        """Plan a motion that grasps the first of several parts.
 
         Args:
             poses: Poses T_base_obj of parts; the first is the part to grasp.
             grasps: The part's grasps, the best first.
-            start: Joints of the arm.
+            start: Current joint angles of the arm.
 
         Returns:
-            The motion for the first reachable grasp, or None.
+            The motion of the first grasp that is reachable without a collision, or None.
         """
         self._place(poses)
         for grasp in grasps:
@@ -217,18 +208,21 @@ class Planner:
         return None
 
     def can_move(self, poses: Sequence[Transform], start: Joints, end: Joints) -> bool:
-        """Return whether the open hand can move between parts at poses T_base_obj."""
+        """Return whether the open hand can move straight in joint space with parts at ``poses``."""
         self._place(poses)
         return self._is_free(np.stack([start, end]), self._gripper.widest)
 
     def _place(self, poses: Sequence[Transform]) -> None:
-        """Place the model's parts at these poses, and its surplus parts out of the way."""
+        """Place the model's parts at poses T_base_obj, and surplus parts away from the bench."""
         for number in range(self._cell.count):
             pose = make_transform(np.eye(3), np.array([2.0, number, 0.5]))
             self._cell.put(self._state, number, poses[number] if number < len(poses) else pose)
 
     def _tools(self, T_base_obj: Transform, grasp: Grasp) -> Iterator[Transform]:
-        """Yield poses of the closed pads' ends, T_base_tool, that grip the part."""
+        """Yield T_base_tool, the pads' ends, for a grasp and its half turn, the deepest pose first.
+
+        A pose is omitted if it is tilted by more than :data:`STEEPEST` or touches the bench.
+        """
         up = self.knowledge.T_base_bench[:3, 2]
         half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
         signs = [[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
@@ -245,7 +239,7 @@ class Planner:
                     yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
 
     def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
-        """Return a collision-free motion to a pose of the finger pads' ends, or None."""
+        """Return a plan that moves the pads' ends to a pose, or None if blocked or out of reach."""
         tip = self.knowledge.tip.copy()
         tip[2] += self._gripper.reach(grasp.width) - self._gripper.reach(0.0)
         T_base_flange = T_base_tool @ make_transform(np.eye(3), -tip)
@@ -266,7 +260,7 @@ class Planner:
         return None if lift is None else Plan(approach, descent, lift, grasp.opening, grasp)
 
     def _line(self, start: Joints, T_from: Transform, T_to: Transform) -> Path | None:
-        """Return joints along a straight line of the flange with constant orientation."""
+        """Return joints that move the flange straight, or None if a pose is out of reach."""
         path = [start]
         for share in np.linspace(0, 1, 7)[1:]:
             between = T_to.copy()
@@ -278,7 +272,7 @@ class Planner:
         return np.stack(path)
 
     def _is_free(self, path: Path, opening: float) -> bool:
-        """Return whether a path of straight lines, with the pads opened, is free of collisions."""
+        """Return whether a path, linear in joint space, is free with the pads ``opening`` apart."""
         for here, there in pairwise(path):
             count = max(2, round(CHECKS * float(np.abs(there - here).max())))
             for share in np.linspace(0, 1, count):
@@ -287,7 +281,7 @@ class Planner:
         return True
 
     def _collides(self, joints: Joints, opening: float) -> bool:
-        """Return whether the arm collides at the given joint angles and finger opening."""
+        """Return whether the robot collides at joint angles with the pads ``opening`` apart."""
         state, cell = self._state, self._cell
         state.qpos[:JOINTS] = joints
         state.qpos[cell.fingers] = self._gripper.fingers(opening)
@@ -297,7 +291,7 @@ class Planner:
         return any(self._is_hit(contact) for contact in state.contact)
 
     def _is_hit(self, contact: Any) -> bool:
-        """Return whether a contact is a collision that involves the robot."""
+        """Return whether a MuJoCo contact of the robot, except within the hand, penetrates."""
         first, second = contact.geom
         if contact.dist > -PENETRATION or (self._hand[first] and self._hand[second]):
             return False

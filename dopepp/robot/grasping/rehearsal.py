@@ -1,8 +1,8 @@
 """Simulated calibrations before the grasps (paper 4.3), with realistic errors.
 
 The arm's joints differ from the controller's readings, and the camera's bracket differs from its
-drawing. Tool, bench, lens and hand-eye are calibrated by :mod:`dopepp.robot.calibration`, from
-touched points and images of a board.
+nominal shape. Tool, bench, lens and hand-eye are calibrated by :mod:`dopepp.robot.calibration`,
+from touched points and images of a board.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ BRACKET: Final = (np.radians(1.0), 0.003)
 
 ZERO: Final = np.radians(0.02)  # standard deviation of a joint's zero: 0.3 mm at the flange
 TOUCH: Final = 1e-4  # standard deviation of a touched point along each axis, metres
-TOUCHES, VIEWS = 8, 15
+TOUCHES, VIEWS = 8, 15  # number of touched points per calibration, and of images of the board
 BOARD: Final = "charuco:8x6:20:15"
 _DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that points straight down
 
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:
-    """True parameters of a robot, unknown to its controller."""
+    """True geometry of a simulated robot, unknown to its controller."""
 
     zero: Joints  # true joints minus the controller's readings, radians
     T_flange_cam: Transform
@@ -63,23 +63,23 @@ class TrueRobot:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedRobot:
-    """Results of a robot's calibrations, and their errors."""
+    """Results of a robot's simulated calibrations, and their errors."""
 
     knowledge: ControllerParameters
     camera: Camera
-    hand_eye_mm: float  # error of the camera's pose at the distance of the parts, millimetres
+    hand_eye_mm: float  # shift of a point at the parts' distance by the hand-eye error, millimetres
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
 
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
-    """Sample a robot's errors; ``tip`` is as in :class:`TrueRobot`."""
+    """Sample the errors of a robot's joints and camera; ``tip`` is as in :class:`TrueRobot`."""
     angle, shift = (rng.normal(0, spread, 3) for spread in BRACKET)
     error = make_transform(Rotation.from_rotvec(angle).as_matrix(), shift)
     return TrueRobot(rng.normal(0, ZERO, JOINTS), MOUNT @ error, tip)
 
 
 def calibrate(robot: TrueRobot, arm: Arm, rng: Generator, distance: float) -> CalibratedRobot:
-    """Calibrate tool, bench, lens and hand-eye; ``distance`` is the parts' distance, metres."""
+    """Calibrate tool, bench, lens and hand-eye; report the error at a camera distance, metres."""
     tip = find_tip(_pivot_poses(robot, arm, rng)).position
     bench = find_bench(_touch_bench(robot, arm, rng, tip)).T_base_bench
     camera, T_flange_cam = _calibrate_camera(robot, arm, rng)
@@ -95,13 +95,13 @@ FlangePair = tuple[Transform, Transform]
 
 
 def _move(robot: TrueRobot, arm: Arm, goal: Transform) -> FlangePair | None:
-    """Move the flange to a pose; return None if the pose is out of reach."""
+    """Return the flange's true and measured pose after a motion to a goal; None out of reach."""
     joints = arm.joints(goal)
     return None if joints is None else (arm.flange(joints), arm.flange(joints - robot.zero))
 
 
 def _draw_reachable(draw: Callable[[], FlangePair | None], count: int) -> list[FlangePair]:
-    """Sample poses and return the first ``count`` poses in reach."""
+    """Return ``count`` reachable poses; raise a ``RunError`` after 4 × ``count`` samples."""
     drawn = (draw() for _ in range(4 * count))
     pairs = [pair for pair in drawn if pair is not None][:count]
     if len(pairs) < count:
@@ -110,7 +110,7 @@ def _draw_reachable(draw: Callable[[], FlangePair | None], count: int) -> list[F
 
 
 def _pivot_poses(robot: TrueRobot, arm: Arm, rng: Generator) -> Float[np.ndarray, "poses 4 4"]:
-    """Return the controller's flange poses while the tip touches a point above the tray."""
+    """Return the measured T_base_flange of poses in which the tip touches a point over the tray."""
 
     def draw() -> FlangePair | None:
         angle = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
@@ -123,7 +123,7 @@ def _pivot_poses(robot: TrueRobot, arm: Arm, rng: Generator) -> Float[np.ndarray
 def _touch_bench(
     robot: TrueRobot, arm: Arm, rng: Generator, tip: Vector
 ) -> Float[np.ndarray, "points 3"]:
-    """Return the controller's readings of points where the tip touches the bench."""
+    """Return measured points of the bench, base frame, metres; ``tip`` is the calibrated tip."""
 
     def draw() -> FlangePair | None:
         touched = TRAY + np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]) + rng.normal(0, TOUCH, 3)
@@ -133,7 +133,7 @@ def _touch_bench(
 
 
 def _calibrate_camera(robot: TrueRobot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
-    """Calibrate lens and hand-eye from images of a board on the bench."""
+    """Return camera and T_flange_cam, calibrated from rendered images of a board on the bench."""
     board, true_camera = parse_board(BOARD), Camera(SIZE, TRUE_K, (), "simulation")
     middle = board.points.mean(axis=0)
     T_base_board = make_transform(_DOWN, TRAY - _DOWN @ middle)

@@ -1,8 +1,8 @@
 """The second view of a grasp: where the arm moves its camera after the first image.
 
-Candidates lie on rings around the part at the first camera's distance. The arm must reach them
-without a collision. The chosen candidate is the one from which an image is expected to reduce the
-error of the part's pose most.
+Candidate camera positions lie on rings around the part, at the distance of the first camera pose.
+The arm must reach them without a collision. The second image is taken at the candidate that is
+expected to reduce the error of the part's pose most.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from dopepp.robot.grasping.cell import TRAY
 from dopepp.robot.grasping.planner import Joints, Planner
 from dopepp.robot.grasping.rehearsal import SIZE, downward_view
 
-TILTS: Final = np.radians([15.0, 25.0, 35.0])  # of the camera from straight down, radians
-NUM_AZIMUTHS: Final = 8  # candidates on each ring
+TILTS: Final = np.radians([15.0, 25.0, 35.0])  # tilt of the camera on each ring, radians
+NUM_AZIMUTHS: Final = 8  # number of candidates on each ring
 
 
 class Viewpoint(NamedTuple):
-    """Joints at which the camera takes the second image, and the reason for this choice."""
+    """Joint angles at which the camera takes the second image, and the reason for this choice."""
 
-    joints: Joints  # as the controller reads them
+    joints: Joints  # angles that the controller reads, radians
     reason: str
 
 
@@ -40,17 +40,18 @@ def choose_viewpoint(
     parts: Sequence[WorldDetection],
     mesh: OutlineMesh,
 ) -> Viewpoint | None:
-    """Return the best second view of the first part; without a part, any other view of the tray.
+    """Return the view that is expected to reduce the pose error of the first part most.
 
     Args:
-        planner: Checks motions of the hand for collisions.
-        K: Calibrated camera matrix.
-        start: Joints at the first image.
-        parts: Parts in the first image, T_base_obj; the first is to be grasped.
+        planner: Planner that checks motions of the hand for collisions.
+        K: Calibrated camera matrix, pixels.
+        start: Joint angles at the first image.
+        parts: Parts detected in the first image, robot base frame; the first is to be grasped.
+            Without a part, the first candidate in reach is returned.
         mesh: Mesh of the part.
 
     Returns:
-        The view, or None if the arm reaches no view that shows the part.
+        The view, or None if the arm reaches no view that shows the whole part.
     """
     T_base_cam = _camera_pose(planner, start)
     middle = mesh.vertices.mean(axis=0)
@@ -81,14 +82,14 @@ def choose_viewpoint(
 
 
 def _camera_pose(planner: Planner, joints: Joints) -> Transform:
-    """Return the controller's T_base_cam at the given joint angles, radians."""
+    """Return T_base_cam by the controller's calibration, at the joint angles that it reads."""
     return np.asarray(planner.arm.flange(joints) @ planner.knowledge.T_flange_cam)
 
 
 def _candidates(
     planner: Planner, point: Vector, distance: float, start: Joints
 ) -> Iterator[Joints]:
-    """Yield the joints at the candidates in reach."""
+    """Yield joint angles of reachable camera poses at ``distance`` (metres) around a point."""
     T_cam_flange = invert_transform(planner.knowledge.T_flange_cam)
     for tilt in TILTS:
         for azimuth in np.linspace(0.0, 2 * np.pi, NUM_AZIMUTHS, endpoint=False):

@@ -1,4 +1,4 @@
-"""The bench of a trial: the solids on it, and the camera's image of them.
+"""The bench of a grasp trial: the solids on it, and the camera's image of them.
 
 To add a layout, write a method of :class:`Layout` and add its name to :data:`LAYOUTS`.
 """
@@ -32,8 +32,8 @@ from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.sensor import capture
 
 LAYOUTS: Final = ("single", "distractors", "heap")  # methods of `Layout`
-SPREAD: Final = 0.025  # radius of the circle that contains a part's centre, metres
-DROP_HEIGHT: Final = 0.0005  # above the bench, metres
+SPREAD: Final = 0.025  # radius of the circle in which a part's centre is sampled, metres
+DROP_HEIGHT: Final = 0.0005  # initial height of objects above the bench, metres
 HEAP: Final = (3, 5)  # minimum and maximum number of parts in a heap
 HEAP_SPREAD: Final = 0.05  # radius within which parts of a heap fall, metres
 HEAP_TILT: Final = 15.0  # largest initial tilt of a falling part, degrees
@@ -50,18 +50,18 @@ STYLE: Final = PRESETS["wide"]
 """Preset of the released networks: light, materials and camera errors."""
 
 UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
-"""Joints of an arm that points at the ceiling, outside the image."""
+"""Joint angles of an arm that points upwards, outside the camera image, radians."""
 
 Photographer = Callable[[Transform, Generator], RGBImage]
-"""Takes an image of objects at rest by a camera at T_base_cam; the generator samples the errors
-of the camera's sensor."""
+"""Renders the objects at rest for a camera at T_base_cam; the generator samples the sensor's noise
+and blur."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedSolid:
-    """An object, and its initial pose T_base_obj."""
+    """An object on the bench and its pose before the simulation starts."""
 
     body: Body
     solid: Solid
@@ -69,7 +69,7 @@ class PlacedSolid:
 
 
 class Layout:
-    """Samples random arrangements of objects on the bench.
+    """Sampler of random arrangements of objects on the bench.
 
     Args:
         part: The part to grasp.
@@ -86,18 +86,18 @@ class Layout:
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
     def draw(self, rng: Generator) -> list[PlacedSolid]:
-        """Sample the objects and their poses, the parts first."""
+        """Sample the objects of this layout and their poses; the parts come first."""
         solids: list[PlacedSolid] = getattr(self, self._name)(rng)
         return solids
 
     def draw_pose(self, rng: Generator) -> Transform:
-        """Sample the pose of a single part in the tray."""
+        """Sample the pose T_base_obj of a single part in the tray."""
         return self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0).T_base_obj
 
     def _draw_part(
         self, rng: Generator, spread: float, height: float, tilt_deg: float
     ) -> PlacedSolid:
-        """Sample a part's pose at ``height`` within ``spread`` of the tray's centre, metres."""
+        """Sample a part's pose ≤ ``spread`` from the tray's centre, ``height`` over it, metres."""
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
             normals, shares = self.body.hull.rests
@@ -116,11 +116,11 @@ class Layout:
         return PlacedSolid(self.body, self.solid, make_transform(rotation, position))
 
     def single(self, rng: Generator) -> list[PlacedSolid]:
-        """Place a single part."""
+        """Sample the pose of a single part."""
         return [self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0)]
 
     def distractors(self, rng: Generator) -> list[PlacedSolid]:
-        """Place a part among distractors that do not touch it."""
+        """Sample a part and 2 to 4 distractors whose bounding circles do not overlap."""
         solids = self.single(rng)
         occupied = [(solids[0].T_base_obj[:3, 3], self.part.diameter / 2)]
         shapes = distractor_shapes()
@@ -140,14 +140,14 @@ class Layout:
         return solids
 
     def heap(self, rng: Generator) -> list[PlacedSolid]:
-        """Drop parts onto each other."""
+        """Sample 3 to 5 parts at increasing heights, which fall onto each other."""
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
         heights = [0.002 + 0.02 * index for index in range(count)]
         return [self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
 
 
 def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
-    """Place a distractor upright on the bench, with a random yaw."""
+    """Place a distractor upright on the bench at ``position``, metres, with a random yaw."""
     rotation = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     height = DROP_HEIGHT - float(body.surface.vertices[:, 2].min())
     solid = Solid(body.pieces, None, (0.35, 0.45, 0.6))
@@ -162,11 +162,7 @@ def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
 
 
 class RasterView:
-    """The project's renderer: random materials and lights, a random image on the bench.
-
-    Args:
-        shadows: Whether parts cast shadows on the bench.
-    """
+    """View of the bench by this project's rasteriser, with or without shadows on the bench."""
 
     def __init__(self, shadows: bool) -> None:
         self._shadows = shadows
@@ -182,13 +178,13 @@ class RasterView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Photographer:
-        """Sample the materials of objects on the bench, the lights and the bench's image.
+        """Sample the objects' materials, the lights and the bench's texture; return the renderer.
 
         Args:
             bodies: Objects on the bench.
             poses: T_base_obj of each object.
-            T_base_cam: Pose of the first camera, to which the lights are relative.
-            rng: Source of all random choices.
+            T_base_cam: Camera pose of the first image; its optical axis hits the lit point.
+            rng: Random generator of the materials, lights and texture.
         """
         T_cam_base = invert_transform(T_base_cam)
         objects = []
@@ -209,14 +205,14 @@ class RasterView:
     def _take(
         self, scene: Scene, T_base_first: Transform, T_base_cam: Transform, rng: Generator
     ) -> RGBImage:
-        """Render the arranged scene from a camera pose, with the sensor's effects."""
+        """Render a scene, defined in the first camera's frame, from another, with sensor errors."""
         scene = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
         scene = scene if self._shadows else replace(scene, plane=None)
         return capture(self._render(scene).image, self._sensors.draw(rng))
 
 
 class MujocoView:
-    """MuJoCo's renderer, which needs OpenGL: one colour per solid, a plain bench."""
+    """View of the bench by MuJoCo's renderer, which needs OpenGL, without random materials."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         self._cell = Cell(solids, shown="solids")
@@ -232,11 +228,11 @@ class MujocoView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Photographer:
-        """Like :meth:`RasterView.arrange`, without random choices."""
+        """Like :meth:`RasterView.arrange`, but only ``poses`` are used."""
         return partial(self._take, poses)
 
     def _take(self, poses: Sequence[Transform], T_base_cam: Transform, rng: Generator) -> RGBImage:
-        """Render the scene from a camera pose, with the solids at these poses."""
+        """Render the solids at ``poses``, T_base_obj, from a camera pose, with sensor errors."""
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
             self._cell.put(state, number, pose)
@@ -251,7 +247,7 @@ class MujocoView:
 
 
 def table_pose(T_base_cam: Transform) -> Transform:
-    """Return T_cam_table, a frame in the bench's plane with its origin on the optical axis."""
+    """Return T_cam_table: base axes, origin where the optical axis meets the bench plane."""
     ahead = T_base_cam[:3, 2]
     origin = T_base_cam[:3, 3] - T_base_cam[2, 3] / ahead[2] * ahead
     return np.asarray(invert_transform(T_base_cam) @ make_transform(np.eye(3), origin))
@@ -259,7 +255,7 @@ def table_pose(T_base_cam: Transform) -> Transform:
 
 @cache
 def has_gl() -> bool:
-    """Return whether MuJoCo can render; otherwise log the reason."""
+    """Return whether MuJoCo can render images; log a warning if not."""
     try:
         open_gl(Cell(shown="solids").model, (64, 64)).close()
     except UserError as error:
@@ -269,7 +265,7 @@ def has_gl() -> bool:
 
 
 def open_gl(model: Any, size: tuple[int, int]) -> Any:
-    """Return a MuJoCo renderer for images of (width, height).
+    """Return a MuJoCo renderer for images of ``size``, (width, height) in pixels.
 
     Raises:
         UserError: OpenGL is not available.
