@@ -1,4 +1,4 @@
-"""The node: poses in the images of a robot's camera, over ROS 2, bags, UDP and stdout.
+"""The node: estimates poses in camera images and sends them by ROS 2, bags, UDP or stdout.
 
 :mod:`.worker` estimates the poses and :mod:`.messages` converts them to ROS messages. The other
 modules are transports. To add a transport, pass images to a :class:`.worker.Worker` and send the

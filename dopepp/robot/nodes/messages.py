@@ -1,7 +1,7 @@
-"""ROS messages of a node, as plain values.
+"""ROS messages of a node, as dicts that need no installed ROS.
 
-Poses are in the camera's optical frame, which has OpenCV's axes. Quaternions are (x, y, z, w), and
-a covariance is of translation and rotation, in this order. Topics are named as in DOPE.
+Poses are in the camera's optical frame, which has OpenCV's axes, in metres. Quaternions are
+(x, y, z, w); covariances have translation before rotation. Topics are named as in DOPE.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.worker import Answer, Stamp
 
-MARKER_FACES: Final = 1000  # triangles of a marker, whose message has 36 kB
+MARKER_FACES: Final = 1000  # largest number of triangles of a marker; its message has 36 kB
 
 TRIANGLE_LIST, ADD, DELETE_ALL = 11, 0, 3  # type and actions of visualization_msgs/Marker
 OK, WARN = 0, 1  # levels of diagnostic_msgs/DiagnosticStatus
@@ -47,40 +47,40 @@ VISION: Final = {
         "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"
     ),
 }
-"""Definitions of ``vision_msgs``, which may be missing in an installation."""
+"""Message definitions of ``vision_msgs``, which a ROS installation may lack."""
 
 Fields = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message to publish."""
+    """A ROS message to publish."""
 
-    topic: str  # `/tf`, or below the node's name without a slash (`pose_part`: `/dope/pose_part`)
-    kind: str  # type, `package/Name`
+    topic: str  # `/tf`, or a name below the node's (`pose_part` means `/dope/pose_part`)
+    kind: str  # message type, `package/Name`
     fields: Fields  # values by field name; nested messages are dicts, image data is bytes
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """A part's triangles for markers, whose conversion to points is cached."""
+    """Triangles of a part's simplified mesh, for RViz markers."""
 
-    corners: Float[np.ndarray, "points 3"]
+    corners: Float[np.ndarray, "points 3"]  # 3 corners per triangle, part's frame, metres
 
     @cached_property
     def points(self) -> list[Fields]:
-        """Three points per triangle."""
+        """Corners as the fields of ``geometry_msgs/Point`` messages."""
         return [_xyz(corner) for corner in self.corners]
 
 
 class AnswerFormatter:
-    """Converts the answers of a worker to messages.
+    """Converter from the answers of a worker to ROS messages.
 
     Args:
-        parts: The worker's parts, with meshes if available.
+        parts: Parts that the worker detects; markers need their meshes.
 
     Raises:
-        UserError: The names of two parts give the same topic name.
+        UserError: Two names of parts are equal after characters outside [A-Za-z0-9_] become _.
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
@@ -93,7 +93,7 @@ class AnswerFormatter:
         self._triangles = {part.name: _triangles(part) for part in parts}
 
     def topics(self) -> list[tuple[str, str]]:
-        """Return the name and message type of every topic except the diagnostics."""
+        """Return the name and message type of each topic except the diagnostics."""
         names = self._names.values()
         return [
             *((f"pose_{name}", "geometry_msgs/PoseStamped") for name in names),
@@ -105,7 +105,7 @@ class AnswerFormatter:
         ]
 
     def messages(self, answer: Answer, is_wanted: Callable[[str], bool]) -> list[Message]:
-        """Return the messages of an answer on the requested topics."""
+        """Return the messages of an answer, for topics on which ``is_wanted`` returns true."""
         header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
         makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
@@ -128,14 +128,14 @@ class AnswerFormatter:
         ]
 
     def _frames(self, answer: Answer) -> list[tuple[str, Detection]]:
-        """Return every detection with its TF frame name, ``<object>_<n>``."""
+        """Return (TF frame name, detection) pairs; the name is ``<object>_<n>``."""
         return [
             (f"{self._names[detection.object]}_{number}", detection)
             for number, detection in zip(answer.numbers, answer.result.detections, strict=True)
         ]
 
     def _detections(self, answer: Answer, header: Fields) -> Fields:
-        """Return the poses as ``vision_msgs/Detection3DArray``."""
+        """Return ``vision_msgs/Detection3DArray`` fields, with the parts' cuboids as boxes."""
         detections = []
         for name, detection in self._frames(answer):
             cuboid, centre = self._cuboids[detection.object], detection.T_cam_obj.copy()
@@ -146,7 +146,7 @@ class AnswerFormatter:
         return {"header": header, "detections": detections}
 
     def _transforms(self, answer: Answer, header: Fields) -> Fields:
-        """Return the poses as ``tf2_msgs/TFMessage``."""
+        """Return the fields of ``tf2_msgs/TFMessage``."""
         transforms = []
         for name, detection in self._frames(answer):
             pose = _pose(detection.T_cam_obj)
@@ -155,7 +155,7 @@ class AnswerFormatter:
         return {"transforms": transforms}
 
     def _markers(self, answer: Answer, header: Fields) -> Fields:
-        """Return the parts' triangles, which replace the markers of the last image."""
+        """Return ``visualization_msgs/MarkerArray`` fields; delete the last image's markers."""
         markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
         for index, detection in enumerate(answer.result.detections):
             red, green, blue = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
@@ -175,7 +175,7 @@ class AnswerFormatter:
 
 
 def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> Message:
-    """Return the diagnosis of a node; an empty problem means that it is running."""
+    """Return the diagnostic message of a node; the level is OK if ``problem`` is empty."""
     status = {
         "level": WARN if problem else OK,
         "name": f"{name}: poses",
@@ -188,7 +188,7 @@ def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> 
 
 
 def image_fields(image: RGBImage, header: Fields) -> Fields:
-    """Return an RGB image as ``sensor_msgs/Image``."""
+    """Return the fields of ``sensor_msgs/Image``."""
     height, width = image.shape[:2]
     size = {"height": height, "width": width, "step": 3 * width}
     layout = {"encoding": "rgb8", "is_bigendian": 0}
@@ -196,7 +196,7 @@ def image_fields(image: RGBImage, header: Fields) -> Fields:
 
 
 def _hypothesis(detection: Detection) -> Fields:
-    """Return ``vision_msgs/ObjectHypothesisWithPose`` with ROS's order of the covariance."""
+    """Return the fields of ``vision_msgs/ObjectHypothesisWithPose``; translation comes first."""
     order = [3, 4, 5, 0, 1, 2]
     covariance = detection.covariance[np.ix_(order, order)]
     return {
@@ -206,18 +206,17 @@ def _hypothesis(detection: Detection) -> Fields:
 
 
 def _pose(T: Transform) -> Fields:
-    """Return a transform as ``geometry_msgs/Pose``."""
+    """Return the fields of ``geometry_msgs/Pose``."""
     w, x, y, z = matrix_to_quaternion(T[:3, :3]).tolist()
     return {"position": _xyz(T[:3, 3]), "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
 def _xyz(values: Float[np.ndarray, "3"]) -> Fields:
-    """Return three numbers as fields x, y and z."""
     return dict(zip("xyz", values.tolist(), strict=True))
 
 
 def _triangles(part: Part) -> Triangles:
-    """Return a part's simplified mesh, which is empty if the part has no mesh."""
+    """Return a part's mesh with at most 1000 faces; empty if the part has no mesh."""
     if part.mesh is None:
         return Triangles(np.zeros((0, 3)))
     vertices, faces = part.mesh.vertices, part.mesh.faces

@@ -1,8 +1,8 @@
-"""A ROS 2 node, with the wheels of the extra ``ros2`` or the rclpy of an installed ROS.
+"""A ROS 2 node, with the wheels of the package extra ``ros2`` or the rclpy of an installed ROS.
 
 The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
 The queue is short. A camera is faster than a network, so the latest image waits in a
-:class:`Slot` while its predecessor is processed. Topics whose messages are not installed
+:class:`Slot` while its predecessor is processed. Topics whose message types are not installed
 (``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
 """
 
@@ -49,12 +49,12 @@ Item = TypeVar("Item")
 
 
 def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> None:
-    """Process the images on a topic until the process is interrupted.
+    """Publish the poses in the images of a ROS 2 topic until the process is interrupted.
 
     Args:
-        worker: Estimates the poses.
+        worker: Estimator of the poses.
         topic: Topic of the images.
-        name: Name of the node.
+        name: Name of the node, which prefixes its topics.
         params: YAML file of ROS 2 parameters.
 
     Raises:
@@ -85,7 +85,7 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
 
 
 class _Node:
-    """Subscribes to images and publishes the worker's answers."""
+    """ROS 2 node that subscribes to images and publishes the worker's poses in them."""
 
     def __init__(self, worker: Worker, topic: str, name: str) -> None:
         import rclpy
@@ -109,7 +109,7 @@ class _Node:
         self.handle.create_timer(1.0, self._tick)
 
     def _declare_parameters(self) -> None:
-        """Declare the worker's settings. A parameter file overrides the command's options."""
+        """Declare the worker's settings as parameters, and apply those of the parameter file."""
         settings = asdict(self._worker.settings)
         for name, value in settings.items():
             with _ros_errors(f"parameter {name}"):
@@ -118,7 +118,7 @@ class _Node:
         self.handle.add_on_set_parameters_callback(self._change)
 
     def _change(self, parameters: Any) -> Any:
-        """Apply changed parameters, all or none."""
+        """Change the worker's settings to new ROS parameters; change none if one is invalid."""
         from rcl_interfaces.msg import SetParametersResult
 
         names = asdict(self._worker.settings)
@@ -130,7 +130,7 @@ class _Node:
         return SetParametersResult(successful=True)
 
     def _update(self, parameters: dict[str, Any]) -> None:
-        """Change the worker's settings."""
+        """Change the worker's settings; a confidence of −1 selects the checkpoint's threshold."""
         if parameters.get("confidence") == CHECKPOINTS:
             parameters = parameters | {"confidence": None}
         self._worker.update(replace(self._worker.settings, **parameters))
@@ -147,7 +147,7 @@ class _Node:
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
     def _subscribe(self) -> None:
-        """Subscribe to the images and their ``camera_info``."""
+        """Replace the subscriptions to the images and their ``camera_info``."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         policy = ReliabilityPolicy.RELIABLE if self._is_reliable else ReliabilityPolicy.BEST_EFFORT
@@ -164,15 +164,14 @@ class _Node:
         ]
 
     def _take_info(self, message: Any) -> None:
-        """Store the newest ``camera_info``, which is valid until the next message."""
         self._info = message
 
     def _take_image(self, message: Any) -> None:
-        """Pass an image with the newest ``camera_info`` to the worker's thread."""
+        """Pass an image and the latest ``camera_info`` to the worker's thread."""
         self.slot.put((message, self._info))
 
     def _answer(self, item: tuple[Any, Any | None]) -> None:
-        """Process an image and publish the answer, in the worker's thread."""
+        """Publish the poses in an image; runs in the worker's thread."""
         answer = self._worker.process(*item, self._topic)
         if answer is None:
             return
@@ -182,7 +181,7 @@ class _Node:
         self._summary = answer.result.summary
 
     def _tick(self) -> None:
-        """Publish the diagnosis once a second, and warn if no images arrive."""
+        """Publish the diagnostics, once a second; without images, try best effort, then warn."""
         self._publish(self._diagnosis())
         if self.slot.received:
             return
@@ -200,7 +199,7 @@ class _Node:
             logger.warning(text, self._topic, others)
 
     def _diagnosis(self) -> Message:
-        """Return the message about the state of the node."""
+        """Return the diagnostic message: image counts, rate, latency and the current problem."""
         self.slot.check()
         counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
@@ -213,7 +212,7 @@ class _Node:
         return diagnosis(stamp, self._name, problem, values)
 
     def _is_best_effort(self) -> bool:
-        """Return whether a publisher of the images offers best-effort delivery only."""
+        """Return whether a publisher of the image topic offers best-effort delivery only."""
         from rclpy.qos import ReliabilityPolicy
 
         offers = self.handle.get_publishers_info_by_topic(self._topic)
@@ -221,7 +220,7 @@ class _Node:
         return any(offer.qos_profile.reliability == best_effort for offer in offers)
 
     def _publish(self, message: Message) -> None:
-        """Publish a message if its topic is advertised."""
+        """Publish a message unless the type of its topic is not installed."""
         if message.topic in self._publishers:
             self._publishers[message.topic].publish(native(message.kind, message.fields))
 
@@ -233,20 +232,13 @@ class _Node:
         return publisher is not None and publisher.get_subscription_count() > 0
 
     def _now(self) -> float:
-        """Return seconds since 1970, by the clock of the stamps."""
+        """Return the ROS clock's time, seconds (since 1970, unless time is simulated)."""
         return float(self._clock.now().nanoseconds / 1e9)
 
 
 @contextmanager
 def _ros_errors(source: str) -> Iterator[None]:
-    """Report errors of ROS in one line.
-
-    Args:
-        source: Setting that probably caused an error.
-
-    Raises:
-        UserError: ROS raised an error.
-    """
+    """Convert exceptions in a ``with`` block to a UserError that suggests correcting ``source``."""
     try:
         yield
     except Exception as error:  # rclpy raises many types
@@ -256,11 +248,11 @@ def _ros_errors(source: str) -> Iterator[None]:
 
 
 class Slot(Generic[Item]):
-    """Passes images to a worker thread; a new image replaces an image that is still waiting.
+    """Queue of length 1 to a worker thread: a new image replaces an image that still waits.
 
     Args:
-        handle: Processes an image in the thread. An exception ends the thread and is raised again
-            by :meth:`put` and :meth:`check`.
+        handle: Function that the thread calls with each image. An exception of this function ends
+            the thread and is raised again by :meth:`put` and :meth:`check`.
     """
 
     def __init__(self, handle: Callable[[Item], None]) -> None:
@@ -273,7 +265,7 @@ class Slot(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Store an image for the thread, replacing a waiting image."""
+        """Store an image for the thread in place of a waiting image."""
         self.check()
         with self._fresh:
             self.received += 1
@@ -282,23 +274,19 @@ class Slot(Generic[Item]):
             self._fresh.notify()
 
     def check(self) -> None:
-        """Check that no exception has ended the thread.
-
-        Raises:
-            Exception: The exception that ended the thread.
-        """
+        """Raise the exception that ended the thread, if any."""
         if self._error is not None:
             raise self._error
 
     def stop(self) -> None:
-        """Stop after the current image."""
+        """Stop the thread after its current image, for which this method waits at most 5 s."""
         with self._fresh:
             self._stopped = True
             self._fresh.notify()
         self._thread.join(PATIENCE_S)
 
     def _run(self) -> None:
-        """Process the newest image until the slot is stopped."""
+        """Process images until :meth:`stop` is called; the thread's main function."""
         try:
             while True:
                 with self._fresh:
@@ -312,7 +300,7 @@ class Slot(Generic[Item]):
 
 
 class Pace:
-    """Measures the rate and the latency of the answers."""
+    """Rate and latency of the published answers, over the last :data:`RECENT` images."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -320,13 +308,13 @@ class Pace:
         self._answered = 0
 
     def count(self, latency_s: float) -> None:
-        """Count an answer; ``latency_s`` is the age of its image."""
+        """Add an answer; ``latency_s`` is the time since its image was captured, seconds."""
         self._times.append(self._clock())
         self._latencies.append(1000 * latency_s)
         self._answered += 1
 
     def values(self) -> dict[str, str]:
-        """Return the available values, for a diagnosis."""
+        """Return the number of answers, their rate and their latency as texts by name and unit."""
         values = {"answered": str(self._answered)}
         if len(self._times) > 1:
             span = self._times[-1] - self._times[0]
@@ -338,7 +326,7 @@ class Pace:
 
 
 def native(kind: str, fields: Fields) -> Any:
-    """Return a ROS 2 message with these values. Missing fields are 0 or empty."""
+    """Return a ROS 2 message of type ``kind``. Fields missing in ``fields`` are 0 or empty."""
     return _fill(type_of(kind)(), fields)
 
 
@@ -354,7 +342,6 @@ def type_of(kind: str) -> Any:
 
 
 def _fill(message: Any, fields: Fields) -> Any:
-    """Set the fields of a message, and return the message."""
     kinds = message.get_fields_and_field_types()
     for name, value in fields.items():
         setattr(message, name, _value(getattr(message, name), kinds[name], value))
@@ -362,7 +349,7 @@ def _fill(message: Any, fields: Fields) -> Any:
 
 
 def _value(default: Any, kind: str, value: Any) -> Any:
-    """Return the value of a field of the ROS type ``kind``."""
+    """Convert a value of :data:`.messages.Fields` to rclpy's value of a field of type ``kind``."""
     if isinstance(value, dict):
         return _fill(default, value)
     if isinstance(value, Triangles):

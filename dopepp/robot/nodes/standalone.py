@@ -1,7 +1,7 @@
 """The node without ROS: lines of JSON on stdout or over UDP, and processing of recordings.
 
 The output for a recording is an ``.mcap`` of ROS 2 with the node's topics at the images' stamps. A
-viewer can open both recordings together. Recordings need the extra ``bags``.
+viewer can open both recordings together. Recordings need the package extra ``bags``.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ logger = logging.getLogger(__name__)
 def send_lines(
     worker: Worker, sources: Iterable[tuple[FrameSource, Camera]], address: str | None = None
 ) -> None:
-    """Send the poses in every image as a line of JSON, like ``dopepp predict --json``.
+    """Send the poses in each image as a line of JSON, like ``dopepp predict --json``.
 
     Args:
-        worker: Estimates the poses.
-        sources: Sources of images with their cameras.
+        worker: Estimator of the poses.
+        sources: Sources of images, e.g. videos, with their cameras.
         address: ``host:port`` of a UDP receiver (default: stdout).
 
     Raises:
@@ -55,7 +55,7 @@ def send_lines(
 
 @contextmanager
 def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
-    """Open a socket; yield a function that sends a line to an address."""
+    """Open a UDP socket; yield a function that sends a line to ``address``, ``host:port``."""
     target, has_warned = _parse_address(address), False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 
@@ -77,7 +77,7 @@ def _datagrams(address: str) -> Iterator[Callable[[str], None]]:
 
 
 def _print(line: str) -> None:
-    """Print a line without buffering."""
+    """Print a line and flush stdout; raise a ``RunError`` if its reader has exited."""
     try:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()  # a reader must not wait for a full buffer
@@ -106,17 +106,17 @@ def _parse_address(text: str) -> tuple[str, int]:
 def process_bag(
     worker: Worker, source: Path, target: Path, topic: str | None, name: str
 ) -> Iterator[Answer | None]:
-    """Write a recording of the answers to a recording's images.
+    """Estimate the poses in a recording's images and write them to a new recording.
 
     Args:
-        worker: Estimates the poses.
-        source: A recording of ROS 1 or 2.
-        target: The ``.mcap`` to write.
-        topic: Topic of the images, if the recording has several.
-        name: Name of the node, which prefixes its topics.
+        worker: Estimator of the poses.
+        source: Recording of ROS 1 or 2.
+        target: Recording to write, an ``.mcap`` file.
+        topic: Topic of the images; None if the recording has a single image topic.
+        name: Name of the node, which prefixes the topics of the new recording.
 
     Yields:
-        The answer to every image, None if the image was not processed.
+        The poses in each image, or None if the image cannot be processed.
 
     Raises:
         UserError: The recording is unreadable, or the target cannot be written.
@@ -141,7 +141,7 @@ def process_bag(
 
 
 class _Recorder:
-    """A ROS 2 recording of a node's topics."""
+    """Writer of an ``.mcap`` recording with the topics of a node, for a ``with`` block."""
 
     def __init__(self, path: Path, name: str, worker: Worker) -> None:
         from rosbags import rosbag2
@@ -174,7 +174,7 @@ class _Recorder:
             next(self._folder.glob(f"*{SUFFIX}")).replace(self._path)
 
     def write(self, answer: Answer, stamp: Stamp) -> None:
-        """Write the messages of an answer at the time of its image."""
+        """Write the messages of an answer with the recording time ``stamp``."""
         for message in self._formatter.messages(answer, self._topics.__contains__):
             kind = _ros2_kind(message.kind)
             content = self._store.serialize_cdr(_filled(self._store, kind, message.fields), kind)
@@ -188,7 +188,7 @@ def _ros2_kind(kind: str) -> str:
 
 
 def _filled(store: Typestore, kind: str, fields: Fields) -> Any:
-    """Return the library's message of plain values. Missing fields are 0 or empty."""
+    """Return rosbags' message of type ``kind``. Fields missing in ``fields`` are 0 or empty."""
     definitions = store.fielddefs[kind][1]
     return store.types[kind](
         **{name: _value(store, node, fields.get(name)) for name, node in definitions}
@@ -196,7 +196,7 @@ def _filled(store: Typestore, kind: str, fields: Fields) -> Any:
 
 
 def _value(store: Typestore, node: Any, value: Any) -> Any:
-    """Return the value of a field, whose type is ``node``."""
+    """Convert a value of ``Fields`` to rosbags' value of a field of type ``node``."""
     from rosbags.interfaces import Nodetype
 
     type_kind, detail = node

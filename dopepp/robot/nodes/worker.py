@@ -21,9 +21,9 @@ from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
 from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
 from dopepp.inference.tracker import PoseTracker
 
-PATIENCE: Final = 5  # consecutive images without ``camera_info`` before the warning
+PATIENCE: Final = 5  # number of consecutive images without ``camera_info`` before the warning
 
-OPTICAL: Final = "optical"  # part of the name of a frame whose z axis points forward (REP 103)
+OPTICAL: Final = "optical"  # part of the name of each frame whose z axis is forward (REP 103)
 
 logger = logging.getLogger(__name__)
 
@@ -36,13 +36,13 @@ class Stamp(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """The time in seconds."""
+        """Time since 1970 as a single number, seconds."""
         return self.sec + self.nanosec / 1e9
 
 
 @dataclass(frozen=True)
 class WorkerSettings:
-    """Settings that may change while a node runs."""
+    """Settings of a worker that may change while it runs."""
 
     confidence: float | None = None  # minimum score of a pose; None: the checkpoint's threshold
     refine: bool = False  # whether poses are refined on the image
@@ -57,18 +57,18 @@ class WorkerSettings:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Poses in an image."""
+    """Poses in an image, with the time and frame for ROS messages."""
 
     stamp: Stamp  # capture time of the image
-    frame_id: str  # frame of the poses: the camera's optical frame
+    frame_id: str  # name of the poses' reference frame: the camera's optical frame
     result: PoseResult
 
     @property
     def numbers(self) -> list[int]:
         """Number n of each pose, for its TF frame ``<object>_<n>``.
 
-        The number is the identity of a track; other detections of an object are numbered by
-        descending score.
+        With tracking, n is the identity of the track; otherwise, an object's detections are
+        numbered from 0 by descending score.
         """
         if self.result.identities is not None:
             return [*self.result.identities]
@@ -77,15 +77,15 @@ class Answer:
 
 
 class Worker:
-    """Processes images in order.
+    """Estimator of the poses in a stream of images; invalid images only cause warnings.
 
     Args:
-        estimator: Estimates the poses.
+        estimator: Estimator of the poses in a single image.
         settings: Initial settings (see :meth:`update`).
         camera: Camera of all images, in place of their ``camera_info``.
-        frame_id: The camera's optical frame, in place of the frame in the messages.
+        frame_id: Name of the camera's optical frame, in place of the frame in the messages.
         track: Track the parts from frame to frame; this includes refinement.
-        warn: Receives warnings.
+        warn: Function that is called with the text of each warning.
 
     Raises:
         UserError: The estimator does not support the settings.
@@ -108,13 +108,13 @@ class Worker:
         self._number = self._num_without_info = 0
         self._shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
         self.problem = ""
-        """The problem with the last image, or an empty string."""
+        """Why the last image could not be processed, or an empty string."""
         self.parts = estimator.solid_parts
         self.settings = WorkerSettings()
         self.update(settings or WorkerSettings(refine=track or estimator.refiner is not None))
 
     def update(self, settings: WorkerSettings) -> None:
-        """Change the settings.
+        """Replace the settings for all further images.
 
         Raises:
             UserError: The settings are not supported; the previous settings remain.
@@ -126,7 +126,7 @@ class Worker:
         self.settings = settings
 
     def _estimator(self, refine: bool) -> PoseEstimator:
-        """Return the estimator with or without refinement. Both share the network."""
+        """Return the estimator with or without refinement; both estimators share the network."""
         if refine not in self._estimators:
             base = self._estimators[not refine]
             term = "region" if refine else None
@@ -134,15 +134,15 @@ class Worker:
         return self._estimators[refine]
 
     def process(self, message: Any, info: Any | None, topic: str) -> Answer | None:
-        """Process the image of a ROS message.
+        """Estimate the poses in the image of a ROS message.
 
         Args:
-            message: The image.
-            info: The ``camera_info`` of the image.
+            message: ``sensor_msgs/Image`` or ``CompressedImage``.
+            info: ``sensor_msgs/CameraInfo`` of the image, if any.
             topic: Topic of the image.
 
         Returns:
-            The answer, or None after a warning if the image cannot be processed.
+            The poses, or None (after a warning) if the image cannot be processed.
         """
         try:
             image = decode_image(message)
@@ -179,15 +179,15 @@ class Worker:
         return Answer(stamp, frame_id, result)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
-        """Estimate the poses in an image.
+        """Estimate the poses in an image with the current settings.
 
         Args:
             frame: The image.
-            camera: Camera that took the image.
-            cropped: Whether the principal point may be far from the centre.
+            camera: Camera that took the image; its lens distortion is removed first.
+            cropped: Whether the image is a crop, with its principal point far from the centre.
 
         Raises:
-            UserError: The camera has another image size.
+            UserError: The camera was calibrated for another image size.
         """
         size = (frame.image.shape[1], frame.image.shape[0])
         if camera.size is not None and camera.size != size:
@@ -222,7 +222,7 @@ class Worker:
         )
 
     def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:
-        """Return the frame of the poses; warn if the frame is not an optical frame."""
+        """Return the name of the poses' frame; warn if it does not contain "optical"."""
         if self._frame_id is not None:
             return self._frame_id
         problem = ""
@@ -238,7 +238,7 @@ class Worker:
         return frame_id
 
     def _check_time(self, stamp: Stamp, topic: str) -> None:
-        """Warn about missing or decreasing stamps; restart the tracking after a decrease."""
+        """Warn about zero or decreasing stamps; restart the tracking after a decrease."""
         last, self._last = self._last, stamp
         if stamp == Stamp(0, 0):
             problem = f"images on {topic} without a stamp, which TF needs: "
@@ -254,17 +254,17 @@ class Worker:
                 self._tracker = PoseTracker(self._estimator(True))
 
     def _reject(self, kind: str, problem: str) -> None:
-        """Store the reason why an image is not processed, and warn."""
+        """Set :attr:`problem`, why the last image is not processed, and warn."""
         self.problem = problem
         self._warn(kind, problem)
 
     def _warn(self, kind: str, text: str) -> None:
-        """Send a warning, once for each kind of problem."""
+        """Send a warning unless a warning of this kind was sent before."""
         if kind not in self._warned:
             self._warned.add(kind)
             self._send_warning(text)
 
 
 def stamp_of(stamp: Any) -> Stamp:
-    """Return the stamp of a message's header."""
+    """Return the :class:`Stamp` of a ROS message's ``header.stamp``."""
     return Stamp(int(stamp.sec), int(stamp.nanosec))

@@ -13,7 +13,7 @@ ARGUMENTS = {
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Start a node, and restart it when it exits."""
+    """Return a launch description that starts a node and restarts it when it exits."""
     arguments = [
         DeclareLaunchArgument(name, default_value=value, description=text)
         for name, (value, text) in ARGUMENTS.items()
