@@ -1,1 +1,1 @@
-"""Images for people: wireframes, belief maps, contact sheets and curves, on numpy images."""
+"""Visualisation: wireframes, belief maps, contact sheets and curves, as numpy images."""

@@ -1,4 +1,4 @@
-"""Curves: accuracy over thresholds, rates over conditions, and values over training.
+"""Plots: accuracy over error thresholds, rates over conditions, and values over training.
 
 Figures are :class:`matplotlib.figure.Figure` objects without pyplot's global state.
 :func:`figure_image` renders a figure to pixels.
@@ -27,15 +27,15 @@ _NUM_STEPS: Final = 200
 """Number of steps of a curve, 0.5 mm each up to 0.1 m."""
 
 _SMOOTHING: Final = 50
-"""Lines with more points are drawn pale, with their moving average over 1/50 of the points."""
+"""Lines with more points are drawn pale, below their moving average over 1/50 of the points."""
 
 
 def accuracy_curve(
     errors: Float[np.ndarray, "n"],
 ) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Return thresholds from 0 to 0.1 m and the share of errors strictly below each.
+    """Return thresholds from 0 to 0.1 m and the share of ``errors`` (metres) strictly below each.
 
-    NaN and infinite errors are misses; without errors every share is 0.
+    NaN and infinite errors are misses; without errors, all shares are 0.
     """
     thresholds = np.linspace(0.0, MAX_THRESHOLD, _NUM_STEPS + 1)
     errors = np.asarray(errors, np.float64)
@@ -52,9 +52,9 @@ def accuracy_figure(
     """Draw accuracy-threshold curves of several methods, with their exact AUC in the legend.
 
     Args:
-        curves: Errors in metres by method; infinite for a miss.
+        curves: Errors of the instances in metres by method; infinite for a miss.
         title: Title of the figure.
-        colours: Matplotlib colours by method; the default cycle if None.
+        colours: Matplotlib colours by method (default: matplotlib's cycle).
     """
     figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():
@@ -73,9 +73,10 @@ def save_accuracy_curves(
     curves: Mapping[str, Float[np.ndarray, "n"]],
     title: str = "",
 ) -> Figure:
-    """Write the curves as ``<path>.png`` and ``<path>.csv`` and return the figure.
+    """Write accuracy-threshold curves to ``<path>.png`` and ``<path>.csv``; return the figure.
 
     The CSV has a column ``threshold_m`` and, for each method, a column with the share in [0, 1].
+    ``curves`` has the errors by method, metres.
     """
     path = Path(path)
     columns = {"threshold_m": accuracy_curve(np.zeros(0))[0]}
@@ -100,7 +101,7 @@ def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figur
 
 
 def figure_image(figure: Figure) -> RGBImage:
-    """Render a figure to RGB without a window, for files and loggers."""
+    """Render a figure to an RGB image, without a window."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
@@ -108,7 +109,7 @@ def figure_image(figure: Figure) -> RGBImage:
 
 
 def _area(errors: Float[np.ndarray, "n"]) -> float:
-    """Return the area under the accuracy-threshold curve up to MAX_THRESHOLD, in [0, 1].
+    """Return the area under the accuracy curve of errors (metres) up to 0.1 m, in [0, 1].
 
     ``metrics.auc`` belongs to a higher layer, which this module cannot import.
     """
@@ -120,7 +121,7 @@ def _area(errors: Float[np.ndarray, "n"]) -> float:
 
 @dataclass(frozen=True)
 class RateCurve:
-    """Rates in [0, 1] at ascending values of a quantity, with confidence limits."""
+    """Rates in [0, 1] at ascending values ``x``, with confidence limits ``low`` and ``high``."""
 
     x: Float[np.ndarray, "points"]
     rate: Float[np.ndarray, "points"]
@@ -136,14 +137,14 @@ def rates_figure(
     *,
     ratio: bool = False,
 ) -> Figure:
-    """Draw panels row by row, with a line and a confidence band for every method.
+    """Draw panels row by row, with a line and a confidence band for each method.
 
     Args:
-        panels: Curves by title and method.
-        x_label: Quantity with its unit.
-        columns: Panels per row.
-        edges: Limits of bins, to mark on the axis.
-        ratio: Whether to use a logarithmic axis with ticks at the measured values.
+        panels: Curves by title of the panel and name of the method.
+        x_label: Label of the x axes: the quantity with its unit.
+        columns: Number of panels per row.
+        edges: Values of x to mark by vertical lines, e.g. limits of bins.
+        ratio: Whether the x axis is logarithmic, with ticks at the curves' values of x.
     """
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")
@@ -173,7 +174,7 @@ def rates_figure(
 
 
 def coverage_figure(curves: Mapping[str, RateCurve]) -> Figure:
-    """Draw the observed over the nominal coverage of covariance regions, with the diagonal."""
+    """Draw the observed over the nominal coverage of pose covariances, in [0, 1], by method."""
     percent = {name: replace(curve, x=100 * curve.x) for name, curve in curves.items()}
     figure = rates_figure({"coverage of the covariances": percent}, "nominal (%)", columns=1)
     axes = figure.axes[0]
@@ -184,7 +185,7 @@ def coverage_figure(curves: Mapping[str, RateCurve]) -> Figure:
 
 @dataclass(frozen=True)
 class PlotLine:
-    """A method's values over training, by run; NaN for missing values."""
+    """Values of a method's training runs over a quantity ``x``, e.g. epochs; NaN if missing."""
 
     name: str
     x: Float[np.ndarray, "points"]
@@ -196,9 +197,9 @@ class PlotLine:
 def lines_figure(
     lines: Sequence[PlotLine], x_label: str, y_label: str, log_y: bool = False
 ) -> Figure:
-    """Draw the mean of each line's runs, within a band from the lowest to the highest run.
+    """Draw the mean over each line's runs, within a band from the lowest to the highest run.
 
-    ``log_y`` selects a logarithmic axis if all values are positive.
+    ``log_y`` selects a logarithmic y axis if all finite values are positive.
     """
     figure, axes = figure_with_axes(x_label, y_label)
     for line in lines:

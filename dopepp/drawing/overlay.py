@@ -1,7 +1,7 @@
 """Wireframes of cuboids, lines and text on an image, for the visual inspection of poses.
 
-A cuboid's +z face is bright and thick, with an arrow head that points to +y. Two orientations of a
-cube therefore never look equal, unless that face is seen edge-on. Text uses matplotlib's font,
+A cuboid's +z face has bright, thick edges and an arrow head that points to +y. Two orientations of
+a cube therefore never look equal, unless that face is seen edge-on. Text uses matplotlib's font,
 because the fonts of cv2 are limited to ASCII.
 """
 
@@ -21,19 +21,19 @@ from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
 Colour = tuple[int, int, int]
-"""RGB, 0..255."""
+"""Red, green and blue, 0 to 255."""
 
 YELLOW: Final[Colour] = (255, 221, 0)
-"""Prediction; DOPE++ in a comparison of two networks (paper Fig. 14)."""
+"""Colour of predictions, or of DOPE++ in a comparison of two networks (paper Fig. 14)."""
 
 GREEN: Final[Colour] = (40, 220, 60)
-"""Ground truth."""
+"""Colour of the ground truth."""
 
 BLUE: Final[Colour] = (70, 165, 255)
-"""The DOPE baseline (paper Fig. 14)."""
+"""Colour of the DOPE baseline (paper Fig. 14)."""
 
 WHITE: Final[Colour] = (255, 255, 255)
-"""Captions."""
+"""Colour of captions."""
 
 MIN_WIDTH_PX: Final = 640  # narrower images are enlarged, for readable lines and legends
 
@@ -46,10 +46,10 @@ _FRONT_TOP: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [1, 1]).all(axi
 
 @dataclass(frozen=True)
 class Wireframe:
-    """A cuboid to draw.
+    """A projected cuboid to draw.
 
     Attributes:
-        keypoints: Eight corners and centroid, pixels; NaN for missing keypoints.
+        keypoints: Eight corners in NDDS order and the centroid, pixels; NaN if missing.
     """
 
     keypoints: Float[np.ndarray, "9 2"]
@@ -60,9 +60,10 @@ class Wireframe:
 def overlay(
     image: RGBImage, wireframes: Sequence[Wireframe], min_width_px: int = MIN_WIDTH_PX
 ) -> UInt8[np.ndarray, "out_height out_width 3"]:
-    """Draw wireframes and their legend on a copy of the image, enlarged if it is narrow.
+    """Draw wireframes and a legend of their labels on a copy of the image.
 
-    Later wireframes lie on top, so pass the truth first.
+    The image is enlarged by an integer factor to at least ``min_width_px``. Later wireframes cover
+    earlier wireframes, so the ground truth should come first.
     """
     factor = max(1, -(-min_width_px // image.shape[1]))
     canvas = enlarge(image, factor)
@@ -84,7 +85,7 @@ def draw_wireframe(
     colour: Colour = YELLOW,
     thickness: int = 1,
 ) -> RGBImage:
-    """Draw a cuboid, anti-aliased, on a copy of the image.
+    """Draw the edges of a projected cuboid, anti-aliased, on a copy of the image.
 
     Args:
         image: Image to copy.
@@ -110,7 +111,7 @@ def draw_wireframe(
 
 
 def enlarge(image: RGBImage, factor: int) -> UInt8[np.ndarray, "out_height out_width 3"]:
-    """Enlarge a copy of the image by an integer factor (``resize_points`` scales keypoints)."""
+    """Return a copy of the image that is ``factor`` times as wide and high (bicubic)."""
     if factor == 1:
         return np.ascontiguousarray(image).copy()
     resized = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
@@ -124,9 +125,9 @@ def draw_line(
     colour: tuple[int, ...],
     thickness: int,
 ) -> None:
-    """Draw an anti-aliased line segment on the canvas, in place.
+    """Draw an anti-aliased line between two pixel positions on the canvas, in place.
 
-    Equal ends give a dot. Ends that are not finite are not drawn.
+    Equal ends give a dot. A line with an end that is not finite is not drawn.
     """
     clipped = _clip(start, end, canvas.shape[1], canvas.shape[0], margin=2 * thickness)
     if clipped is None:
@@ -139,7 +140,7 @@ def draw_line(
 def _clip(
     start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: int, height: int, margin: int
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """Clip a segment to image and margin (Liang–Barsky), because cv2 overflows far outside."""
+    """Clip a segment to the image plus ``margin`` px (Liang–Barsky), else cv2 may overflow."""
     if not (np.isfinite(start).all() and np.isfinite(end).all()):
         return None
     direction = end - start
@@ -166,9 +167,9 @@ def draw_text(
     size_px: int,
     colour: tuple[int, int, int],
 ) -> None:
-    """Write a line IN PLACE on a darkened box, cut off at the border.
+    """Draw a line of text in place on a darkened box, cut off at the image border.
 
-    ``position`` is (column, row) of the top left corner, pixels, at least 0.
+    ``position`` is (column, row) of the text's top left corner, pixels, at least 0.
     """
     column, row = position
     box = image[row : row + size_px, column:]
@@ -179,17 +180,17 @@ def draw_text(
 
 
 def draw_caption(image: RGBImage, text: str) -> None:
-    """Write a line of text IN PLACE in the bottom left corner; an empty text draws nothing."""
+    """Draw a line of text in place in the bottom left corner; nothing for an empty text."""
     size = max(12, round(max(image.shape[:2]) / 50))
     if text:
         draw_text(image, text, (0, max(image.shape[0] - size, 0)), size, WHITE)
 
 
 def draw_tags(image: RGBImage, tags: Sequence[tuple[str, tuple[float, float], Colour]]) -> None:
-    """Write a line of text IN PLACE above each of several points, without overlap.
+    """Draw a line of text in place above each of several points, without overlap.
 
     A tag is a text, a point (column, row) in pixels and a colour; texts of points outside the image
-    are written at the border.
+    are drawn at the border.
     """
     size = max(12, round(max(image.shape[:2]) / 50))
     taken: list[tuple[int, int, int]] = []
@@ -208,7 +209,7 @@ def draw_tags(image: RGBImage, tags: Sequence[tuple[str, tuple[float, float], Co
 
 @lru_cache(maxsize=256)
 def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
-    """Return each pixel's coverage by a line of text, in [0, 1]; a shared, read-only array."""
+    """Return each pixel's coverage by a line of text, in [0, 1]; cached, so do not modify it."""
     # Imported on demand, so that a command that only prints poses starts faster.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

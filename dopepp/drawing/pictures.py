@@ -1,9 +1,9 @@
 """Image and video files: strict decoding of images, and crash-safe writing of videos.
 
-This module decodes all photos, textures, frames, depth images and masks, completely or not at all.
-Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding. The checksums
-of a PNG and the end of a JPEG are checked here. To accept a further format of plain pixels, add its
-name to :data:`FORMATS`.
+This module decodes all photos, textures, frames, depth images and masks; a damaged file is an
+error. Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding. The
+checksums of a PNG and the end of a JPEG are checked here. To accept a further raster format, add
+its name to :data:`FORMATS`.
 """
 
 from __future__ import annotations
@@ -30,45 +30,45 @@ from dopepp.core.files import partial_path, read_limited
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 RGBImage = UInt8[np.ndarray, "height width 3"]
-"""RGB, first row on top."""
+"""RGB image, 8 bits per channel, first row on top."""
 
 Size = tuple[int, int]
 """(width, height), pixels."""
 
 Shape = tuple[int, int]
-"""(height, width), as an array's."""
+"""(height, width) of an image array, pixels."""
 
 Mask = Bool[np.ndarray, "height width"]
 
 DepthMap = Float[np.ndarray, "height width"]
-"""Metres along z; 0 for unknown."""
+"""Depth along the optical axis in metres; 0 for unknown."""
 
 FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
-"""Formats of plain pixels; PIL would pass EPS to another program."""
+"""Accepted raster formats by Pillow's names; for EPS, Pillow would start another program."""
 
 FRAME_FORMATS: Final = ("PNG", "JPEG")
-"""Formats of the frames of YCB-Video, NDDS and FAT."""
+"""Formats of the frames of YCB-Video, NDDS and FAT data sets."""
 
 MAX_SIDE: Final = 8192
-"""Longest side, pixels: 0.2 GB in memory. A small file can declare any size."""
+"""Longest side of a picture, pixels: 0.2 GB in memory. A small file can declare any size."""
 
 MAX_PIXELS: Final = 64_000_000
-"""Largest image of a data set: twice the largest industrial cameras."""
+"""Largest number of pixels of a data set's image: twice that of the largest industrial cameras."""
 
 MAX_BYTES: Final = 256_000_000
-"""Largest file: the pixels that :data:`MAX_SIDE` allows, without compression."""
+"""Largest size of an image file: the pixels that :data:`MAX_SIDE` allows, without compression."""
 
 DARKEST: Final = 16
-"""Smallest maximum (of 255) of a 16-bit image; 12 significant bits stay below."""
+"""Smallest valid maximum (of 255) of a 16-bit image; values of 12 bits stay below."""
 
 MIN_FREE: Final = 16_000_000
-"""Free bytes on the disk below which writing stops, so that the file can still be completed."""
+"""Free bytes on the disk below which the writing of a video stops, so that it can be closed."""
 
 USUAL_RATE: Final = 25.0
-"""Frames per second of a file or camera that does not state its rate."""
+"""Assumed frames per second of a video or camera that does not state its rate."""
 
 LONGEST_GAP_S: Final = 2.0
-"""Longest time for which an image is repeated if the next is late, seconds."""
+"""Longest time for which a video repeats an image if the next image is late, seconds."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8"
@@ -76,12 +76,12 @@ _JPEG_END: Final = b"\xff\xd9"
 
 
 def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
-    """Return an image in one of :data:`FORMATS` as RGB.
+    """Read an image in one of :data:`FORMATS` as RGB.
 
     Args:
         path: File, with any suffix.
-        longest_px: Longest side; larger images are reduced (a JPEG is then decoded at a fraction
-            of its size and time).
+        longest_px: Longest side, pixels; larger images are reduced (a JPEG is then decoded at a
+            fraction of its size and time).
 
     Raises:
         ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
@@ -101,7 +101,7 @@ def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
 
 
 def whole_image(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
-    """Decode a file's content with its original depth and channels.
+    """Decode an image file's content with the file's bit depth and channels.
 
     Raises:
         ValueError: The content has another format, is damaged, or exceeds :data:`MAX_PIXELS`.
@@ -120,7 +120,7 @@ def read_content(path: Path) -> bytes:
     """Return an image file's bytes.
 
     Raises:
-        UserError: The file is missing or too large.
+        UserError: The file is missing, unreadable or larger than :data:`MAX_BYTES`.
     """
     try:
         return read_limited(path, MAX_BYTES)
@@ -134,7 +134,7 @@ def read_content(path: Path) -> bytes:
 
 
 def read_image(path: Path) -> NDArray[Any]:
-    """Read a PNG or JPEG frame with its original depth and channels, colours as R, G, B(, A).
+    """Read a PNG or JPEG with the file's bit depth and channels, colours as R, G, B(, A).
 
     Raises:
         UserError: The file is missing, damaged, of another format, or has 16-bit colours.
@@ -162,10 +162,10 @@ def read_image(path: Path) -> NDArray[Any]:
 
 
 def read_rgb(path: Path) -> RGBImage:
-    """Read an 8-bit frame as RGB; alpha is dropped, grey becomes three channels.
+    """Read an 8-bit PNG or JPEG as RGB; alpha is dropped, grey becomes three channels.
 
     Raises:
-        UserError: As for :func:`read_image`, or the image does not have 8 bits.
+        UserError: As for :func:`read_image`, or the image does not have 8 bits per channel.
     """
     image = read_image(path)
     if image.dtype != np.uint8:
@@ -177,7 +177,7 @@ def read_rgb(path: Path) -> RGBImage:
 
 
 def read_photo(path: Path) -> RGBImage:
-    """Read an image in one of :data:`FORMATS` as upright 8-bit RGB, with OpenCV's values.
+    """Read an image in one of :data:`FORMATS` as upright 8-bit RGB, with the values of OpenCV.
 
     The EXIF orientation is applied, alpha dropped, grey repeated, and 16 bits cut to the upper 8.
 
@@ -212,7 +212,7 @@ def read_photo(path: Path) -> RGBImage:
 
 
 def _open(content: bytes, formats: tuple[str, ...]) -> Image.Image:
-    """Open an image and check its container, without decoding."""
+    """Open an image without decoding; raise a ``ValueError`` for a damaged or unknown file."""
     damage = "" if content else "an empty file"
     if content.startswith(_PNG):
         damage = _png_damage(content)
@@ -232,7 +232,7 @@ def _open(content: bytes, formats: tuple[str, ...]) -> Image.Image:
 
 
 def _png_damage(content: bytes) -> str:
-    """Check the chunks (length, type, data, checksum) up to IEND; return the damage, or ''."""
+    """Return where a PNG's chunks are damaged or end before IEND, or an empty string."""
     start = len(_PNG)
     while start + 12 <= len(content):
         length = int.from_bytes(content[start : start + 4], "big")
@@ -249,12 +249,12 @@ def _png_damage(content: bytes) -> str:
 
 
 def _is_deep_colour(content: bytes) -> bool:
-    """Return whether a PNG's header (after signature, length, type and size) has 16-bit colour."""
+    """Return whether a file is a PNG with 16-bit colours, from bytes 24 and 25 of its header."""
     return content.startswith(_PNG) and content[24] == 16 and content[25] != 0
 
 
 def _is_deep(image: Image.Image, content: bytes) -> bool:
-    """Return whether a PNG's header or a TIFF's tag declares 16 bits per channel."""
+    """Return whether the header of a PNG or a tag of a TIFF declares 16 bits per channel."""
     bits = getattr(image, "tag_v2", {}).get(ExifTags.Base.BitsPerSample, (8,))
     return max(bits) == 16 or (content.startswith(_PNG) and content[24] == 16)
 
@@ -265,7 +265,7 @@ def _reason(error: Exception) -> str:
 
 
 class VideoFile(AbstractContextManager["VideoFile"]):
-    """An MP4 file (MPEG-4 part 2), written to a partial file that is renamed on close.
+    """Writer of an MP4 file (MPEG-4 part 2), which is a partial file until it is closed.
 
     Images are repeated or dropped to match their times, and resized to the first image's size.
     Odd sides are padded by one pixel, as the format requires even sides.
@@ -285,7 +285,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
         self._written = 0
 
     def write(self, image: RGBImage, time: float) -> None:
-        """Add an image taken at a time in seconds.
+        """Add an image that was taken at ``time``, seconds from any origin.
 
         Raises:
             RunError: The disk is full, or this OpenCV cannot write MP4.
@@ -313,10 +313,10 @@ class VideoFile(AbstractContextManager["VideoFile"]):
             self._written += 1
 
     def close(self) -> None:
-        """Close the video, check its number of frames and move it to the final path.
+        """Close the partial file, rename it to the final path and check its number of frames.
 
         Raises:
-            RunError: Frames are missing from the file.
+            RunError: The file has fewer frames than were written.
         """
         if self._writer is None:
             return

@@ -16,13 +16,13 @@ from dopepp.drawing.pictures import DepthMap, Mask, RGBImage
 from dopepp.geometry.cuboid import CENTROID
 
 _CAPTION_PX: Final = 18
-_MIN_CAPTION_PX: Final = 9  # smallest readable line; longer text is cut
+_MIN_CAPTION_PX: Final = 9  # smallest readable text height; text that is still too long is cut
 
 COLOURS: Final[tuple[Colour, ...]] = (
     (230, 25, 75), (60, 180, 75), (255, 225, 25), (0, 130, 200), (245, 130, 48),
     (145, 30, 180), (70, 240, 240), (240, 50, 230), (210, 245, 60), (250, 190, 212),
 )  # fmt: skip
-"""Colours of instances, distinguishable with most kinds of colour blindness."""
+"""Colours of object instances, distinguishable with most kinds of colour blindness."""
 
 AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
 """Colours of the axes x (red), y (green) and z (blue)."""
@@ -39,7 +39,7 @@ class Tile:
 
 
 def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> RGBImage:
-    """Lay tiles out row by row on white, each scaled to ``tile_width`` pixels.
+    """Arrange tiles row by row on white, each scaled to a width of ``tile_width`` pixels.
 
     Raises:
         ValueError: There are no tiles.
@@ -53,7 +53,7 @@ def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320
 
 
 def _draw_tile(tile: Tile, width: int) -> RGBImage:
-    """Scale the image and add its caption, shrunk to fit."""
+    """Scale a tile's image to a width (pixels) and add its caption below."""
     scale = width / tile.image.shape[1]
     height = max(1, round(tile.image.shape[0] * scale))
     # Area averaging suits shrinking; cubic interpolation suits enlarging.
@@ -63,7 +63,7 @@ def _draw_tile(tile: Tile, width: int) -> RGBImage:
 
 
 def text_line(text: str, width: int) -> RGBImage:
-    """Return a line of black text on a white strip of ``width`` pixels, shrunk to fit."""
+    """Return black text on a white strip of ``width`` pixels, as small as needed to fit."""
     # Hinted glyphs do not scale exactly with the size, so sizes are tried in descending order.
     lines = (text_coverage(text, px) for px in range(_CAPTION_PX, _MIN_CAPTION_PX, -1))
     smallest = text_coverage(text, _MIN_CAPTION_PX)
@@ -74,7 +74,7 @@ def text_line(text: str, width: int) -> RGBImage:
 
 
 def grid(images: Sequence[RGBImage], columns: int) -> RGBImage:
-    """Arrange images row by row on white.
+    """Arrange images row by row on white, without gaps; images of a row are aligned at the top.
 
     Raises:
         ValueError: There are no images or no columns.
@@ -95,7 +95,7 @@ def grid(images: Sequence[RGBImage], columns: int) -> RGBImage:
 
 
 def message_image(width: int, height: int, text: str) -> RGBImage:
-    """Return a grey image with a message; lines beyond its height are cut."""
+    """Return a grey image (size in pixels) with wrapped text; lines that do not fit are cut."""
     image = np.full((height, width, 3), 225, np.uint8)
     size = max(10, int(0.05 * width))
     # On average, a character is half as wide as the line is high.
@@ -111,9 +111,9 @@ def message_image(width: int, height: int, text: str) -> RGBImage:
 def belief_tiles(
     image: RGBImage, beliefs: Float[np.ndarray, "9 map_height map_width"], stride: int, name: str
 ) -> list[Tile]:
-    """Return a tile of the corners' and a tile of the centroid's beliefs, over an image.
+    """Return two tiles of belief maps over an image: the corners' maximum, and the centroid's.
 
-    Captions begin with ``name`` and end with the largest belief.
+    Captions begin with ``name`` and end with the largest belief. ``stride`` is in pixels per cell.
     """
     maps = {"corners": beliefs[:CENTROID].max(axis=0), "centroid": beliefs[CENTROID]}
     return [
@@ -125,7 +125,7 @@ def belief_tiles(
 def heat_picture(
     image: RGBImage, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
 ) -> RGBImage:
-    """Blend a belief map into the dimmed image, with the belief (clipped to [0, 1]) as opacity.
+    """Blend a belief map into the dimmed image, with 0.8 times the belief (0 to 1) as opacity.
 
     The image has the scale of the network's input, ``stride`` pixels per cell of the map.
     """
@@ -140,7 +140,7 @@ def heat_picture(
 
 
 def mask_panel(image: RGBImage, masks: Sequence[Mask | None]) -> RGBImage:
-    """Paint each instance's visible pixels on the darkened grey image."""
+    """Paint each instance's mask in the instance's colour on the darkened grey image."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2)
     panel = 0.35 * grey.astype(np.float64)
     for number, mask in enumerate(masks):
@@ -151,9 +151,10 @@ def mask_panel(image: RGBImage, masks: Sequence[Mask | None]) -> RGBImage:
 
 
 def depth_panel(depth: DepthMap, shown: Mask) -> tuple[RGBImage, str]:
-    """Colour depth from near (red) to far (blue), unknown depth black; return image and scale.
+    """Colour depth from near (red) to far (blue), unknown depth black; return image and legend.
 
-    The scale spans the ``shown`` pixels (the objects), because a plane may extend far behind them.
+    The colours span the depths of the ``shown`` pixels (the objects), because a plane may extend
+    far behind the objects.
     """
     measured = depth > 0
     scale = depth[measured & shown] if (measured & shown).any() else depth[measured]
@@ -171,7 +172,7 @@ def depth_panel(depth: DepthMap, shown: Mask) -> tuple[RGBImage, str]:
 
 
 def draw_axes(image: RGBImage, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
-    """Draw the object frame's axes IN PLACE, except for ends that are not finite or far outside.
+    """Draw an object frame's axes in place, except axes that are not finite or end far outside.
 
     ``ends`` are the projections of the origin and of the tips of x, y and z, pixels.
     """
