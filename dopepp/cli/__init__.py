@@ -37,17 +37,17 @@ COMMANDS: Final = (
     data_commands.symmetries,
     experiment_commands.release,
 )
-"""Commands with options of their own, in the order of ``--help``."""
+"""Commands whose arguments Typer parses, unlike Hydra's overrides, in the order of ``--help``."""
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
-"""Usage error of the click version that Typer bundles or imports."""
+"""Class of usage errors of the click version that Typer bundles or imports."""
 
 
 class _OneLineErrors(TyperGroup):
-    """Reports a wrong option or a missing argument in one line."""
+    """Group of commands that reports a wrong option or a missing argument in one line."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; print an expected error as one line."""
+        """Run a command; print a usage error as one line and exit with code 2."""
         try:
             return super().invoke(ctx)
         except _UsageError as error:
@@ -60,7 +60,6 @@ app = typer.Typer(cls=_OneLineErrors, no_args_is_help=True)
 
 
 def _show_version(is_requested: bool) -> None:
-    """Print the version and exit, if the option is given."""
     if is_requested:
         typer.echo(f"dopepp {__version__}")
         raise typer.Exit

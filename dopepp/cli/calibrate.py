@@ -254,7 +254,7 @@ def rig(
 
 
 def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> PoseFormat:
-    """Check the options that describe a file of robot poses, and combine them."""
+    """Return the conventions of a file of robot poses from the options, after checking them."""
     from dopepp.robot.calibration.records import UNITS, PoseFormat
 
     check_choice("--unit", unit, UNITS)
@@ -265,7 +265,7 @@ def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> Pos
 
 
 def _image_names(folder: Path) -> list[str]:
-    """Return the names of a folder's images, sorted.
+    """Return the file names of a folder's images, sorted by name.
 
     Raises:
         UserError: The folder has no images.
@@ -282,7 +282,7 @@ def _image_names(folder: Path) -> list[str]:
 
 
 def _board_poses(folder: Path, spec: str, camera: Path) -> list[BoardPose]:
-    """Estimate the board's poses in a folder's images, taken by one camera."""
+    """Estimate the board's pose in each image that shows it; ``spec`` is the value of --board."""
     from dopepp.geometry.camera_file import read_camera
     from dopepp.robot.calibration.board import board_pose, parse_board
 
@@ -292,7 +292,7 @@ def _board_poses(folder: Path, spec: str, camera: Path) -> list[BoardPose]:
 
 
 def _detect_in_folder(folder: Path, board: Board) -> tuple[list[BoardDetection], Size]:
-    """Detect the board in a folder's images, which must have one size."""
+    """Detect the board in a folder's images; return the detections and the images' common size."""
     from dopepp.drawing.pictures import read_photo
 
     detections: list[BoardDetection] = []
@@ -312,9 +312,9 @@ def _detect_in_folder(folder: Path, board: Board) -> tuple[list[BoardDetection],
 
 
 def _detect_in_stream(source: str, board: Board) -> tuple[list[BoardDetection], Size]:
-    """Collect distinct views of the board from a video or a camera stream.
+    """Detect the board in a video or a camera stream, and keep distinct views of it.
 
-    The collection ends with the stream, on Ctrl-C, or with enough views.
+    The search ends with the stream, on Ctrl-C, or with 60 views. Returns views and image size.
     """
     from dopepp.inference.frames import open_sources
     from dopepp.robot.calibration.lens import CHECKS_PER_S, Views
@@ -344,7 +344,7 @@ def _detect_in_stream(source: str, board: Board) -> tuple[list[BoardDetection], 
 def _detect_board(
     board: Board, image: RGBImage, name: str, reports_missing: bool = False
 ) -> BoardDetection | None:
-    """Detect the board in an image; report an image with two boards, or optionally without any."""
+    """Detect the board in an image; print a line for two boards or (optionally) without a board."""
     try:
         detection = board.detect(image, name)
     except UserError as error:
@@ -358,7 +358,7 @@ def _detect_board(
 def _check_detections(
     detections: list[BoardDetection], size: Size | None, source: str, count: int
 ) -> tuple[list[BoardDetection], Size]:
-    """Return the detected boards and the images' size; reject images without any board."""
+    """Return detections and image size; raise a ``UserError`` if no image shows the board."""
     if not detections or size is None:
         raise UserError(
             f"{source}: no board in any of {count} images",
@@ -376,7 +376,7 @@ def _bench_from_board(
     poses: Path | None,
     pose_format: PoseFormat,
 ) -> tuple[Bench, list[str]]:
-    """Calibrate the bench from images of a board; return the bench and the images' names."""
+    """Calibrate the bench from images of a board on it; return the bench and the images' names."""
     from dopepp.core.yaml import read_yaml
     from dopepp.geometry.transform_file import read_transform
     from dopepp.robot.calibration.board import parse_board
@@ -410,7 +410,7 @@ def _bench_from_board(
 
 
 def _show_lens(calibration: LensCalibration) -> None:
-    """Print the errors per image, the covered part of the image, and the camera matrix."""
+    """Print reprojection errors, image cells with points, and intrinsics ± standard deviations."""
     for name, error in zip(calibration.names, calibration.errors_px, strict=True):
         typer.echo(f"{name}: {error:.3f} px")
     for name in calibration.outliers:
@@ -431,7 +431,7 @@ def _show_lens(calibration: LensCalibration) -> None:
 def _show_hand_eye(
     boards: Sequence[BoardPose], calibration: HandEye, quality: CalibrationQuality
 ) -> None:
-    """Print each image's errors, the robot's estimated error, and advice on further poses."""
+    """Print the errors of each pose and of the robot, expected errors, and advice on more poses."""
     from math import degrees
 
     for number, board in enumerate(boards):
@@ -453,7 +453,7 @@ def _show_hand_eye(
 
 
 def _show_rig(calibration: Rig) -> None:
-    """Print rejected images, and each camera's reprojection error and standard deviations."""
+    """Print rejected images, and reprojection error and pose uncertainty of each camera."""
     from math import degrees, hypot
 
     for moment in calibration.outliers:
@@ -472,7 +472,7 @@ def _show_rig(calibration: Rig) -> None:
 def _rig_record(
     calibration: Rig, T_base_first: Transform, folder: Path, out: Path
 ) -> dict[str, object]:
-    """Return the content of the rig's file: the pose and folder of every camera."""
+    """Return the content of the rig file ``out``; ``T_base_first`` is the first camera's pose."""
     from math import degrees
     from os.path import relpath
 
@@ -492,7 +492,7 @@ def _rig_record(
 
 
 def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:
-    """Return the content of the hand-eye file: both transforms with their covariance."""
+    """Return the content of the hand-eye file: poses of camera and board, and their errors."""
     from dopepp.geometry.transform_file import transform_record
 
     mount, other = ("flange", "base") if calibration.mount == "hand" else ("base", "flange")

@@ -91,7 +91,9 @@ def load_estimator(
     max_ms: float | None = None,
     scale_error: float | None = None,
 ) -> PoseEstimator:
-    """Load a checkpoint, or make an estimator of a mesh, which always refines by region.
+    """Load a checkpoint, or make an estimator for a mesh, which always refines by region.
+
+    The arguments are the values of the options of the same names; see their help.
 
     Raises:
         UserError: The model is invalid, or an option does not apply to it.
@@ -132,7 +134,7 @@ def load_estimator(
 
 
 def two_numbers(option: str, text: str, allowed: str, example: str) -> tuple[float, float]:
-    """Read two numbers with a comma between them.
+    """Parse the value of an option that consists of two numbers with a comma between them.
 
     Raises:
         UserError: The text has another form; the message contains ``allowed`` and the example.
@@ -146,10 +148,10 @@ def two_numbers(option: str, text: str, allowed: str, example: str) -> tuple[flo
 
 
 def check_region(refine: str | None) -> None:
-    """Check that the refinement is ``region`` or none.
+    """Check the value of ``--refine`` of a command that only offers refinement by region.
 
     Raises:
-        UserError: The refinement is neither.
+        UserError: The value is neither ``region`` nor None.
     """
     if refine not in (None, "region"):
         raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")
@@ -157,7 +159,7 @@ def check_region(refine: str | None) -> None:
 
 @contextmanager
 def report_errors() -> Iterator[None]:
-    """Print an expected error as one line and exit with its code."""
+    """Convert expected errors in a ``with`` block to a line on stderr and the error's exit code."""
     try:
         yield
     except (UserError, RunError, Interruption) as error:
@@ -167,10 +169,10 @@ def report_errors() -> Iterator[None]:
 
 @contextmanager
 def resumable(advice: str = RESUME) -> Iterator[None]:
-    """Report errors, and exit cleanly on Ctrl-C or SIGTERM.
+    """Like :func:`report_errors`; Ctrl-C and SIGTERM in the block are expected errors, too.
 
     Args:
-        advice: Recommendation in the message of an interruption.
+        advice: Text at the end of the message about an interruption.
     """
     with report_errors(), interruptible(advice):
         yield

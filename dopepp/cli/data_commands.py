@@ -27,7 +27,7 @@ class RenderCommand(TyperCommand):
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help with the names of all presets, which no other command reads."""
+        """Write the help with the presets' names, which are imported for the help only."""
         from dopepp.virtual.presets import PRESETS
 
         (preset,) = (parameter for parameter in self.params if parameter.name == "preset")

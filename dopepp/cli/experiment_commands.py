@@ -15,7 +15,7 @@ HYDRA_OPTIONS: Final = {"ignore_unknown_options": True, "help_option_names": []}
 
 
 def _overrides(command: str) -> Any:
-    """Return the argument for overrides, with shell completion for ``train`` or ``evaluate``."""
+    """Return the Typer argument for Hydra overrides of a command, with shell completion."""
 
     def complete(ctx: typer.Context, incomplete: str) -> list[str]:
         from dopepp.experiment.command_line import complete
@@ -27,7 +27,7 @@ def _overrides(command: str) -> Any:
 
 
 def _start(command: str) -> None:
-    """Run ``train`` or ``evaluate`` on the arguments of the command line."""
+    """Run ``train`` or ``evaluate`` with the Hydra overrides in ``sys.argv``."""
     from dopepp.experiment.entries import start
 
     start(command, num_words=2)

@@ -100,7 +100,7 @@ def propose(
 
 
 def _require_extra() -> None:
-    """Check that the packages of the extra are installed, without importing them.
+    """Check that the packages of the extra ``robot`` are installed, without importing them.
 
     Raises:
         UserError: A package is missing.

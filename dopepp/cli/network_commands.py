@@ -84,7 +84,7 @@ def benchmark(
 
 
 def _row(path: Path, timing: Timing) -> dict[str, str]:
-    """Return a row of the table: medians, and the 95th percentile of whole frames."""
+    """Return a model's row of the benchmark table, in milliseconds, by column name."""
     import numpy as np
 
     p50, p95 = np.percentile(timing.frame, (50, 95))
@@ -100,7 +100,7 @@ def _row(path: Path, timing: Timing) -> dict[str, str]:
 
 
 def _print_table(rows: list[dict[str, str]]) -> None:
-    """Print rows with aligned columns; the first column is the model."""
+    """Print rows of :func:`_row` with aligned columns; the first column is the model."""
     widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in rows[0]}
     for row in ({key: key for key in rows[0]}, *rows):
         cells = [row[key].rjust(width) for key, width in list(widths.items())[1:]]
@@ -175,7 +175,7 @@ def doctor(
 
 
 def _pixel(text: str) -> tuple[float, float]:
-    """Read column and row of a part's centre, ``u,v``."""
+    """Parse a value of ``--at``, (column, row) of a part's centre in pixels."""
     return two_numbers("--at", text, "u,v in pixels", "412,230")
 
 

@@ -120,7 +120,7 @@ def node(
 def _check_transport(
     chosen: Sequence[str], words: Sequence[str], out: Path | None, params: Path | None
 ) -> str:
-    """Return the transport after rejecting options that exclude each other."""
+    """Return the only entry of ``chosen``; reject other numbers, and options that do not suit."""
     if len(chosen) != 1:
         problem = " and ".join(chosen) or "no input and output"
         allowed = "one of --ros2, --bag FILE --out FILE, --json, --udp HOST:PORT"

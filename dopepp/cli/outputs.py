@@ -27,34 +27,33 @@ VIDEO: Final = ".mp4"
 
 
 class Output(Protocol):
-    """Writes results, source by source."""
+    """Writer of pose results to files, source by source."""
 
     def begin(self, source: FrameSource) -> None:
-        """Start the results of a source."""
+        """Prepare for the results of the next source, e.g. the frames of a video."""
 
     def write(self, result: PoseResult) -> None:
-        """Write a result."""
+        """Write the poses in an image of the current source."""
 
     def close(self) -> None:
-        """Finish and close the files. Also called after an error, with the results so far."""
+        """Finish and close the files; also called after an error, with the results so far."""
 
 
 class Outputs:
-    """Writes each result to several outputs; a failed disk operation raises a :class:`RunError`."""
+    """Outputs that a ``with`` block closes; an ``OSError`` of theirs becomes a `RunError`."""
 
     def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs
 
     def begin(self, source: FrameSource) -> None:
-        """Start the results of a source."""
+        """Call :meth:`Output.begin` of each output."""
         self._each(lambda output: output.begin(source))
 
     def write(self, result: PoseResult) -> None:
-        """Write a result."""
+        """Call :meth:`Output.write` of each output."""
         self._each(lambda output: output.write(result))
 
     def _each(self, action: Callable[[Output], None]) -> None:
-        """Call a method of every output."""
         for path, output in self._outputs:
             with _disk_errors(path):
                 action(output)
@@ -72,7 +71,10 @@ class Outputs:
 
 
 class OverlayFolder:
-    """Writes an image for each input image, and a video for each video or camera, to a folder."""
+    """Output of images with drawn poses to a folder; videos and cameras become videos.
+
+    ``stride`` is the number of frames of a video from one result to the next.
+    """
 
     def __init__(self, folder: Path, stride: int = 1) -> None:
         check_target(folder / "picture.png")
@@ -82,12 +84,12 @@ class OverlayFolder:
         self._video: VideoFile | None = None
 
     def begin(self, source: FrameSource) -> None:
-        """Close the previous source's video."""
+        """Close the video of the previous source, if any."""
         self.close()
         self._source = source
 
     def write(self, result: PoseResult) -> None:
-        """Write the image, or append it to the source's video."""
+        """Write the image with drawn poses, or append it to the current source's video."""
         assert self._source is not None
         if result.time is None:
             path = Path(result.name)
@@ -109,7 +111,7 @@ class OverlayFolder:
             video.close()
 
     def _new_path(self, stem: str, suffix: str, source: Path) -> Path:
-        """Return a path that this command has not used yet and that is not the source."""
+        """Return a path in the folder, numbered if its name was used; reject the source's path."""
         name, number = f"{stem}{suffix}", 1
         while name in self._names:
             number += 1
@@ -124,7 +126,7 @@ class OverlayFolder:
 
 
 class JsonLines:
-    """Writes a file with a line of JSON for each image, with or without detections."""
+    """Output of a file with a line of JSON for each image, even without detections."""
 
     def __init__(self, path: Path) -> None:
         check_target(path)
@@ -132,14 +134,14 @@ class JsonLines:
         self._file: FileIO | None = None
 
     def begin(self, source: FrameSource) -> None:
-        """Open the file at the first source."""
+        """Open a partial file, unless it is open from a previous source."""
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def write(self, result: PoseResult) -> None:
-        """Append one line for the image. A line that does not fit on the disk is removed again.
+        """Append a line for the image.
 
         Raises:
-            OSError: The disk is full.
+            OSError: The disk is full; the incomplete line is removed.
         """
         assert self._file is not None
         line, end = f"{result.to_json()}\n".encode(), self._file.tell()
@@ -148,14 +150,14 @@ class JsonLines:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def close(self) -> None:
-        """Close the partial file and move it to the final path."""
+        """Close the partial file, if any, and rename it to the final path."""
         if self._file is not None:
             self._file.close()
             self._partial.replace(self._path)
 
 
 class BopCsv:
-    """Writes poses in the format of the BOP challenge; each source is a scene.
+    """Output of poses to a CSV file in the format of the BOP challenge; each source is a scene.
 
     Objects are numbered from 1 in the checkpoint's order, or as in their names if all names have
     the form ``obj_000005``.
@@ -168,11 +170,11 @@ class BopCsv:
         self._scene = -1
 
     def begin(self, source: FrameSource) -> None:
-        """Start the next scene."""
+        """Increase the scene number."""
         self._scene += 1
 
     def write(self, result: PoseResult) -> None:
-        """Keep the poses until the file is written."""
+        """Store the poses in an image; :meth:`close` writes them."""
         from dopepp.data.formats.bop.bop_models import model_numbers
         from dopepp.data.formats.bop.bop_results import BopResult
 
@@ -184,7 +186,7 @@ class BopCsv:
             self._rows.append(row)
 
     def close(self) -> None:
-        """Write the file, if any source was processed."""
+        """Write the file, if :meth:`begin` was called for any source."""
         if self._scene >= 0:
             from dopepp.data.formats.bop.bop_results import write_results
 
@@ -193,7 +195,7 @@ class BopCsv:
 
 @contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
-    """Convert an ``OSError`` in the block to a :class:`RunError` that names the path."""
+    """Convert an ``OSError`` in a ``with`` block to a :class:`RunError` that names the path."""
     try:
         yield
     except OSError as error:

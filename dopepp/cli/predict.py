@@ -165,15 +165,10 @@ def predict(
 
 
 def _exclude(option: str, others: dict[str, object]) -> None:
-    """Reject options that cannot be combined with an option.
-
-    Args:
-        option: Name of the given option.
-        others: Values of the excluded options by name; a false value means that the option is not
-            given.
+    """Reject ``others`` (values by option name, false if not set), which ``option`` excludes.
 
     Raises:
-        UserError: One of the excluded options is given.
+        UserError: One of the other options is set.
     """
     if given := ", ".join(name for name, value in others.items() if value):
         fix = f"leave out {option}, or {given}"
@@ -183,7 +178,7 @@ def _exclude(option: str, others: dict[str, object]) -> None:
 def _file_outputs(
     save: Path | None, json_file: Path | None, csv: Path | None, stride: int
 ) -> list[tuple[Path, Output]]:
-    """Return the outputs that are written to files or folders, with their paths."""
+    """Return (path, output) pairs of the requested files; ``stride`` is the option's value."""
     from dopepp.cli.outputs import BopCsv, JsonLines, OverlayFolder
 
     requests: tuple[tuple[Path | None, Callable[[Path], Output]], ...] = (
@@ -195,17 +190,16 @@ def _file_outputs(
 
 
 def _floor(score: float) -> float:
-    """Round a score down to three decimals."""
     return math.floor(1000 * score) / 1000
 
 
 class _Session:
-    """Processes sources and prints the results.
+    """Estimator of the poses in the images of sources, which it also prints.
 
     Args:
-        estimator: Estimates the poses.
-        options: Options for all sources.
-        verified: Parts to render and compare with the image; None for no verification.
+        estimator: Estimator of the poses in a single image.
+        options: Options of :func:`dopepp.inference.stream.stream` for all sources.
+        verified: Parts whose contours are compared with the image; None for no comparison.
     """
 
     def __init__(
@@ -214,7 +208,7 @@ class _Session:
         self._estimator, self._options, self._verified = estimator, options, verified
 
     def run(self, source: FrameSource, camera: Camera, outputs: Outputs) -> None:
-        """Print and write the poses in every image of a source."""
+        """Print the poses in each image of a source, and pass them to the outputs."""
         from dopepp.inference.pose_result import format_speed
 
         total = source.count and math.ceil(source.count / self._options["stride"])
@@ -235,10 +229,10 @@ class _Session:
             outputs.write(result)
 
     def _search_again(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
-        """Search at all distances after an empty result.
+        """Search for parts at all distances in an image without detections.
 
         Returns:
-            The new result, and the reason if it is empty as well.
+            The new result, and why it has no detections (an empty string if it has any).
         """
         if not self._estimator.has_network:
             return result, "no pose at these distances passes the verification"
@@ -262,10 +256,10 @@ class _Session:
         return result, format_reasons(reason)
 
     def _records(self, result: PoseResult) -> list[dict[str, object]]:
-        """Return the detections as plain values.
+        """Return a JSON object for each detection.
 
-        With ``--verify``, ``agreement`` states how well the part's outline and creases agree with
-        the image, in [0, 1].
+        With ``--verify``, its ``agreement`` in [0, 1] states how well the part's outline and
+        creases agree with the image.
         """
         records = result.records()
         if self._verified is None:

@@ -1,4 +1,4 @@
-"""``dopepp predict --views``: poses in the world from several images of one static scene."""
+"""``dopepp predict --views``: poses in a world frame from several images of a static scene."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def predict_scene(
     save: Path | None,
     json_file: Path | None,
 ) -> None:
-    """Estimate the poses of parts in a static scene; print and write them.
+    """Estimate the poses of parts from all images of a static scene; print and write the poses.
 
     Args:
         estimator: Estimator that refines by region.
         sources: Images of the scene.
         views: File of the camera poses.
-        camera: Camera of the images for which ``views`` names no camera.
+        camera: Intrinsics of the images for which ``views`` names no camera file.
         distances: Nearest and farthest depth of the parts, metres, or ``any``.
-        save: Folder for drawn images; None writes none.
+        save: Folder for images with drawn poses; None writes none.
         json_file: File for a line of JSON; None writes none.
 
     Raises:
