@@ -51,15 +51,15 @@ def compile_in_background(function: str) -> None:
 
 
 class _Compilation(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Starts the warm-ups at numba's first compilation, and logs the reason for the delay.
+    """Starts the registered functions at numba's first compilation, and logs the delay's reason.
 
-    Garbage collection is paused, because it would take a quarter of the time without effect.
+    Garbage collection is paused during a compilation, as it would take a quarter of the time.
     """
 
     is_first, depth, collects = True, 0, False
 
     def on_start(self, event: event.Event) -> None:
-        """Pause garbage collection; at the first compilation, start the warm-ups."""
+        """Pause garbage collection; at the first compilation, start the registered functions."""
         if self.depth == 0:
             self.collects = gc.isenabled()
             gc.disable()

@@ -153,7 +153,7 @@ def partial_path(path: Path) -> Path:
 
 
 def is_abandoned(path: Path, now: float) -> bool:
-    """Return whether a partial file's process has ended or, at ``now``, the file is 10 min old."""
+    """Return whether a partial file's process has ended, or its age at ``now`` exceeds 600 s."""
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True
@@ -179,7 +179,7 @@ def _is_running(process: int) -> bool:
 
 @cache
 def _machine() -> str:
-    """Return eight hex digits that identify the machine or container of the process ids."""
+    """Return eight hex digits for this machine or container, the scope of unique process ids."""
     # Host names are not unique (containers, ``localhost``), so on Linux the boot and the process
     # namespace are included.
     facts = [socket.gethostname()]

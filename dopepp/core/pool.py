@@ -98,7 +98,7 @@ class PickledFunction:
         self._function: Callable[[Any], Any] | None = None
 
     def __call__(self, item: object) -> bytes:
-        """Apply the function to an item."""
+        """Return the pickled (value, error) pair of an item."""
         try:
             if self._function is None:
                 self._function = pickle.loads(self._content)
@@ -268,7 +268,7 @@ _environment_lock = threading.Lock()
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables in the block, for the processes that are started in it."""
+    """Set environment variables in the block, for processes started in it, and restore them."""
     with _environment_lock:
         previous = {name: os.environ[name] for name in variables if name in os.environ}
         os.environ.update(variables)

@@ -229,7 +229,6 @@ def short_repr(value: object, max_length: int = 100) -> str:
 
 @cache
 def _adapter(kind: type[T]) -> TypeAdapter[T]:
-    """Return pydantic's validator of a type."""
     # A class of an extension may have arguments that no plain value can represent.
     config = None if dataclasses.is_dataclass(kind) else ConfigDict(arbitrary_types_allowed=True)
     return TypeAdapter(kind, config=config)

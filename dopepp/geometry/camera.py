@@ -97,7 +97,7 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> CameraMatrix:
 
 
 def resize_camera(K: CameraMatrix, scale_x: float, scale_y: float) -> CameraMatrix:
-    """Return K of an image that is resized by ``scale_x`` and ``scale_y``."""
+    """Return K of an image that is resized by the factors ``scale_x`` and ``scale_y``."""
     # As pixel centres are integers, u becomes s·(u + ½) − ½.
     resized = np.array(K, np.float64)
     resized[0] *= scale_x
@@ -135,8 +135,8 @@ class Letterbox:
     Attributes:
         width: Width of the resized image, pixels.
         height: Height of the resized image, pixels.
-        scale_x: Factor of the width.
-        scale_y: Factor of the height.
+        scale_x: Width of the resized image over the original width.
+        scale_y: Height of the resized image over the original height.
     """
 
     width: int

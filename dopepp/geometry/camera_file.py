@@ -79,13 +79,13 @@ class Camera:
         """Return the camera of an image, after checking K against the image's size.
 
         Args:
-            size: (width, height) of the image.
+            size: (width, height) of the image, pixels.
             K_size: (width, height) of the calibrated image, if this image was resized.
             crop: Region (x, y, width, height) of the calibrated image, if this image is a crop.
 
         Raises:
-            UserError: K belongs to another size and neither option explains it, or an option is
-                invalid.
+            UserError: K belongs to another size, which neither ``K_size`` nor ``crop`` explains, or
+                an option is invalid.
         """
         if K_size is not None and crop is not None:
             problem, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
@@ -141,7 +141,7 @@ def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
 
 
 def _camera(calibration: Calibration, source: str) -> Camera:
-    """Check K and the number of distortion coefficients, and return the camera."""
+    """Return a calibration's camera, after checking K and the number of distortion coefficients."""
     K = pinhole_matrix(calibration.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
         problem = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"

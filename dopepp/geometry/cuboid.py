@@ -35,7 +35,7 @@ EDGES: Final[tuple[tuple[int, int], ...]] = tuple(
 
 
 def cuboid_keypoints(lower: Vector, upper: Vector) -> Cuboid:
-    """Return the eight corners and the centre of a box from its bounds, metres, object frame.
+    """Return a box's eight corners (NDDS order) and centre from its bounds, metres, object frame.
 
     Raises:
         ValueError: A bound is not finite, or ``lower`` exceeds ``upper``.

@@ -63,8 +63,8 @@ class PnPResult:
     Attributes:
         T_cam_obj: Object-to-camera transform, metres; None without a plausible pose.
         reprojection_error_px: RMS distance over the inliers, pixels; infinite without a pose.
-        inliers: Points that agree with the pose within :data:`~dopepp.geometry.refine.GATE`
-            standard deviations.
+        inliers: Whether each point is within :data:`~dopepp.geometry.refine.GATE` standard
+            deviations of its projection.
         reason: Reason for the missing pose; empty with a pose.
         covariance: Covariance of a rotation vector about the object's origin and a shift (camera
             axes, radians, metres), from the inliers' covariances; None without a pose.
@@ -90,9 +90,9 @@ def solve_pnp(
         object_points: Points in the object frame, metres.
         image_points: Positions of the points on the image, pixels; NaN marks a missing point.
         K: Camera matrix, pixels; it may have skew.
-        covariance_px: Covariance of each or every pixel position, pixels² (default: one pixel of
-            standard deviation). A point is missing if its covariance is not finite and positive
-            definite.
+        covariance_px: Covariance of each point's position, or one for all points, pixels² (default:
+            one pixel of standard deviation). A point is missing if its covariance is not finite and
+            positive definite.
         widenings: Ascending factors on the standard deviations, tried in turn until two thirds of
             the points agree on a pose. The pose with the most agreeing points is returned.
 
@@ -328,10 +328,10 @@ def _improve(
     best: float,
     agree: Bool[np.ndarray, "n"],
 ) -> float:
-    """Refine the ``NUM_STARTS`` starts of least cost; update the best pose and its inliers.
+    """Refine the starts of least truncated cost; update the best pose and its inliers ``agree``.
 
-    Start poses are a rotation vector and a translation. For a plate with a ``normal``, the mirrored
-    tilt of each start pose is refined as well.
+    Start poses are a rotation vector and a translation; ``NUM_STARTS`` of them are refined. For a
+    plate with a ``normal``, the mirrored tilt of each start pose is refined as well.
 
     Returns:
         The truncated cost of the best pose.

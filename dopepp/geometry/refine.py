@@ -204,7 +204,7 @@ def normal_equations(
 
 @compiled()
 def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -> None:
-    """Write the solution of (H + damping) step = −gradient, with H scaled to a unit diagonal."""
+    """Write the solution of (H + damping·I) step = −gradient, with H scaled to a unit diagonal."""
     solve_inside(hessian, gradient, damping, step, np.empty((7, 6)))
 
 
@@ -341,7 +341,7 @@ def _spreads(
 
 @compiled()
 def column_mean(rows: Array, column: int) -> float:
-    """Return the mean of a column."""
+    """Return the mean of a column of a 2-D array."""
     total = 0.0
     for i in range(len(rows)):
         total += rows[i, column]

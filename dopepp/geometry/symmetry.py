@@ -74,7 +74,7 @@ def _normalise(axis: Sequence[float]) -> Vector:
 def rotations_about(
     centre: Vector, rotations: Float[np.ndarray, "rotations 3 3"]
 ) -> Float[np.ndarray, "rotations 4 4"]:
-    """Return rotations about a point as rigid transforms."""
+    """Return rotations about a point (metres) as rigid transforms."""
     transforms = np.tile(np.eye(4), (len(rotations), 1, 1))
     transforms[:, :3, :3], transforms[:, :3, 3] = rotations, centre - rotations @ centre
     return transforms

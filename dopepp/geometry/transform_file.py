@@ -33,7 +33,7 @@ _FIX: Final = "write the transform in metres, or pass a file from `dopepp calibr
 
 
 def transform_record(T: Transform) -> dict[str, object]:
-    """Return a transform as matrix, position (metres) and quaternion (w, x, y, z)."""
+    """Return a transform as a dictionary: matrix, position (metres) and quaternion (w, x, y, z)."""
     return {
         "matrix": T.tolist(),
         "position": T[:3, 3].tolist(),

@@ -33,7 +33,7 @@ CameraImages = Sequence[tuple[RGBImage, CameraMatrix]]
 
 @dataclass(frozen=True)
 class Timing:
-    """Time per frame, milliseconds."""
+    """Measured times per frame, milliseconds, and mean number of detected poses."""
 
     first: float  # first frame after loading
     frame: Float[np.ndarray, "frames"]  # each later frame, from image to poses
@@ -42,7 +42,7 @@ class Timing:
 
 
 def time_frames(estimator: PoseEstimator, images: CameraImages, num_frames: int) -> Timing:
-    """Time a freshly loaded estimator on ``num_frames`` frames, cycling through the images."""
+    """Time a newly loaded estimator on ``num_frames`` frames (cycled images) after a warm-up."""
     rows, num_found = [], []
     for image, K in islice(cycle(images), 1 + WARM_UP + num_frames):
         before, start = estimator.spent_ms.copy(), time.perf_counter()

@@ -70,7 +70,7 @@ class _Maps(nn.Module):
 
 
 def check_possible(layout: str, precision: str) -> None:
-    """Check that a format supports a precision and that the required extras are installed.
+    """Check that a format (``layout``) supports a precision and the required extras are installed.
 
     Raises:
         UserError: The format does not support the precision, or a required extra is not installed.
@@ -152,7 +152,7 @@ EXPORTERS: Final[dict[str, tuple[Exporter, str]]] = {
 
 
 def _trace(network: PoseNetwork) -> ExportedProgram:
-    """Trace a network for any batch, height and width."""
+    """Trace a network by ``torch.export`` for any batch size, height and width."""
     multiple = network.size_multiple
     example = torch.zeros(2, 3, 3 * multiple, 4 * multiple, dtype=torch.uint8)
     free = {0: Dim("batch"), 2: multiple * Dim("rows"), 3: multiple * Dim("columns")}

@@ -233,7 +233,7 @@ def network_views(
 
 
 def check_region(roi: Region | None, image: RGBImage) -> Region | None:
-    """Return a region of an image in whole pixels.
+    """Return a region of an image, rounded to whole pixels.
 
     Raises:
         UserError: The region extends beyond the image.

@@ -120,7 +120,7 @@ class Motion:
         return Motion(T_cam_obj, velocity, updated, correction)
 
     def _velocity_change(self, sudden: bool) -> Step:
-        """Return the standard deviations of the change in velocity."""
+        """Return the standard deviations of the velocity's change per frame, radians and metres."""
         least = SUDDEN if sudden else STILL
         deviations = []
         for number, unit in enumerate((1.0, float(self.T_cam_obj[2, 3]))):
@@ -211,7 +211,7 @@ class PoseTracker:
             cropped: As in :meth:`PoseEstimator.predict`.
 
         Returns:
-            Visible parts with scores of at least the estimator's threshold, sorted by identity.
+            Parts that are not lost and have at least the estimator's minimum score, by identity.
 
         Raises:
             UserError: The image is not an RGB image, or K does not belong to it.
@@ -232,7 +232,7 @@ class PoseTracker:
         return [track for track in tracks if track.detection.score >= self.estimator.min_score]
 
     def _is_doubtful(self, state: _State) -> bool:
-        """Return whether the network must search a part on this frame."""
+        """Return whether the network must search a part that is lost, uncertain or contradicted."""
         unsure = _agreement(state.track.detection) < SURE and self._frame % OFTEN == 0
         return bool(unsure or state.unseen or state.doubts or state.disagreements)
 

@@ -34,7 +34,7 @@ def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> lis
     """Open frame sources in the given order. Consecutive image files form one sequence.
 
     Args:
-        sources: Paths, glob patterns, camera numbers, URLs and open sources.
+        sources: Paths, glob patterns, camera numbers, URLs and opened frame sources.
         topic: Image topic of a ROS recording that has several.
 
     Raises:

@@ -138,7 +138,6 @@ class Video(FrameSource):
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[cv2.VideoCapture]:
-        """Open the file for the duration of the block."""
         capture = _open_capture(self.name, cv2.CAP_FFMPEG)
         try:
             if not capture.isOpened():

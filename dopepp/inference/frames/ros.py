@@ -150,7 +150,7 @@ class Bag(FrameSource):
     """Images of one topic of a ROS recording.
 
     Args:
-        path: File or folder.
+        path: File or folder of the recording.
         topic: Image topic; required if several topics have images.
 
     Raises:

@@ -117,8 +117,8 @@ def log_odds(
     """Return the log odds that each pixel shows the part and not its surroundings.
 
     Args:
-        bins: Colour bins.
-        mask: 1 at the assumed pose of the part.
+        bins: Colour bin of each pixel.
+        mask: 1 where the part covers the pixel at its assumed pose, else 0.
         unsure: Width of the band on each side of the outline that neither histogram counts, pixels.
         ring: Width of the surroundings, pixels.
         tiles: Tiles along each side of the part's box.

@@ -104,7 +104,7 @@ class PosedMesh:
 
 
 def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> PosedMesh | None:
-    """Project a mesh; return None if a vertex is not in front of the camera."""
+    """Project a mesh at a pose; return None if a vertex is not in front of the camera."""
     arms, pixels = np.empty_like(mesh.vertices), np.empty((len(mesh.vertices), 2))
     front = np.empty(len(mesh.faces), np.bool_)
     if not _pose(mesh.vertices, mesh.planes, T_cam_obj, K, arms, pixels, front):
@@ -115,7 +115,7 @@ def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> PosedMesh
 def filled_mask(
     mesh: OutlineMesh, posed_mesh: PosedMesh, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Return a mask of (width, height): 1 if the mesh covers the pixel's centre, else 0."""
+    """Return a mask of size (width, height): 1 if the mesh covers the pixel's centre, else 0."""
     width, height = size
     mask = np.empty((height, width), np.uint8)
     winding = np.zeros((1 if mesh.is_closed else 2, height, width + 1), np.int32)

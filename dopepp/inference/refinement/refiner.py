@@ -155,7 +155,8 @@ class Refiner:
     ) -> Detection:
         """Return a detection with the probability that its pose is correct, if poses are verified.
 
-        ``moved`` is the Mahalanobis distance that refinement has moved the pose.
+        A pose is correct if ADD(-S) is below a tenth of the diameter. ``moved`` is the Mahalanobis
+        distance by which refinement has moved the pose.
         """
         verifier = self._refiners[detection.object].verifier
         if verifier is None:

@@ -40,12 +40,12 @@ MIN_ALONG: Final = 0.15
 
 
 class UndecidedError(Exception):
-    """Reason why the measurements do not determine a pose."""
+    """The measurements do not determine a pose; the message is the reason."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Result of refining a pose."""
+    """Refined pose with its covariance, or the start pose and the reason why it was kept."""
 
     T_cam_obj: Transform
     covariance: PoseMatrix | None = None  # see PnPResult; None if the given pose was kept
@@ -66,7 +66,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Normal distribution of a pose."""
+    """Normal distribution of a pose, i.e. of the step (rotation vector, shift) from its mean."""
 
     T_cam_obj: Transform  # mean
     information: PoseMatrix  # inverse of the covariance

@@ -55,7 +55,7 @@ Arrays = tuple[
 
 @dataclass(frozen=True)
 class Export:
-    """Options and measurements of an export."""
+    """Options of an export, and measured properties of the exported network."""
 
     __pydantic_config__ = STRICT
 
@@ -126,7 +126,7 @@ class ExportedNetwork(ABC):
 
 
 def is_export(path: Path) -> bool:
-    """Return whether a path is an exported network rather than a checkpoint."""
+    """Return whether a path is an exported network (a folder or, by its suffix, a file)."""
     return path.is_dir() or path.suffix in SUFFIXES
 
 
@@ -169,7 +169,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def check_shapes(path: Path, shapes: Mapping[str, Iterable[int] | None], num_pixels: int) -> None:
-    """Check that no tensor of a graph is out of proportion to the input.
+    """Check that no tensor of a graph has over ``_MAX_PER_PIXEL`` elements per pixel of the input.
 
     A few bytes of a malicious file could otherwise allocate all memory.
 

@@ -113,7 +113,7 @@ def check_model(model: onnx.ModelProto, path: Path, size: tuple[int, int]) -> No
 
     Raises:
         UserError: The model has weights in other files, operators of another domain, nested graphs,
-            other inputs or outputs, or a tensor out of proportion.
+            other inputs or outputs, or a tensor that :func:`check_shapes` rejects.
     """
     import onnx
 

@@ -60,8 +60,8 @@ def contradictions(
     """Find contradictions between views, and reject detections that depend on a wrong camera pose.
 
     Args:
-        detections: Detections that pass the threshold.
-        observations: Observations of each view that pass the threshold.
+        detections: Detections in the world with at least the minimum score.
+        observations: Observations of each view with at least the minimum score.
         images: Images with the poses of their cameras.
         names: Name of each view.
         associated: Function that groups the observations of several views by part.

@@ -71,8 +71,8 @@ def next_best_view(
         mesh: Mesh of the part, as :func:`~dopepp.inference.refinement.outline.make_outline_mesh`
             prepares it.
         T_world_obj: Pose of the part, metres.
-        covariance: Its covariance, world axes; see :class:`WorldDetection`.
-        candidates: Camera poses that can be reached, ``T_world_cam``.
+        covariance: Covariance of the pose, world axes; see :class:`WorldDetection`.
+        candidates: Reachable camera poses ``T_world_cam``, metres.
         K: Camera matrix, pixels.
         size: (width, height) of the image, pixels.
         T_world_bench: Pose of a bench, whose plane z = 0 must be below the cameras; None without a

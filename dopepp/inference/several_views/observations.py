@@ -43,18 +43,21 @@ class PartGeometry:
         return cls(part.cuboid, group)
 
     def nearest(self, pose: Prior, to: Transform) -> Prior:
-        """Return the symmetry-equivalent of a pose whose cuboid is nearest to that of ``to``."""
+        """Return the symmetric equivalent of ``pose`` that is nearest to ``to``.
+
+        The distance is the sum of the squared distances between corresponding keypoints.
+        """
         equal = pose.T_cam_obj @ self.group
         points = self.cuboid @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
         distances = ((points - transform(to, self.cuboid)) ** 2).sum(axis=(1, 2))
         return Prior(np.asarray(equal[distances.argmin()]), pose.information)
 
     def separation(self, pose: Prior, other: Prior) -> float:
-        """Return the Mahalanobis distance of a pose from the nearest equivalent of ``other``."""
+        """Return the Mahalanobis distance of two poses; see :meth:`nearest` for symmetric parts."""
         return separation(pose, self.nearest(other, pose.T_cam_obj))
 
     def mean(self, poses: Sequence[Prior]) -> Prior:
-        """Return the mean, weighted by information, of poses as equivalents near the first pose."""
+        """Return the information-weighted mean; see :meth:`nearest` for symmetric parts."""
         first = poses[0].T_cam_obj
         information, gradient = np.zeros((6, 6)), np.zeros(6)
         for pose in poses:

@@ -103,7 +103,7 @@ class ViewsResult:
         return [detection.to_record() for detection in self.detections]
 
     def to_json(self) -> str:
-        """Return image names, findings and detections as one line of JSON."""
+        """Return image names, contradictions ("findings") and detections as one line of JSON."""
         images = [view.name for view in self.views]
         content = {"images": images, "findings": list(self.findings), "detections": self.records()}
         return json.dumps(content, ensure_ascii=False, allow_nan=False)

@@ -136,7 +136,7 @@ class DepthEvidence:
         return end
 
     def visible(self, pose: Transform) -> Visible:
-        """Return which of the part's points are visible at a pose."""
+        """Return which of the part's points are not hidden by the part itself at a pose."""
         return visible(self._surface, pose)
 
     def information(self, pose: Transform, is_visible: Visible) -> PoseMatrix:

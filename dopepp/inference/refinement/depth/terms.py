@@ -71,10 +71,10 @@ def plane_terms(
 
     Args:
         view: Crop of the depth image.
-        overlay: Posed part on the depth.
+        overlay: Comparison of the posed part with the depth.
         origin: Object's origin, camera frame.
         spacing: Spacing of the part's points.
-        reach: Largest distance that has a weight.
+        reach: Largest distance from a point's plane that has a weight.
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
     planes = overlay.distance, overlay.nearest, overlay.points, overlay.normals
@@ -121,10 +121,10 @@ def outline_terms(
 def _to_surface(
     overlay: SurfaceOverlay, in_front: Int[np.ndarray, "past"], supported: Mask
 ) -> Pulls:
-    """Pull the part's points in front of the measured depth to the nearest supported pixel.
+    """Return points in front of the measured depth, and shifts to the nearest supported pixels.
 
     Args:
-        overlay: Posed part on the depth.
+        overlay: Comparison of the posed part with the depth.
         in_front: Indices of points that lie in front of the measured depth.
         supported: Pixels whose depth agrees with the part.
     """
@@ -139,10 +139,10 @@ def _to_surface(
 
 
 def _to_pixels(overlay: SurfaceOverlay, continues: Mask) -> Pulls:
-    """Pull the part's points towards adjacent pixels that continue its surface.
+    """Return points next to pixels that continue the part's surface, and shifts towards them.
 
     Args:
-        overlay: Posed part on the depth.
+        overlay: Comparison of the posed part with the depth.
         continues: Pixels next to the part whose depth continues its surface.
     """
     rows, columns = np.nonzero(continues)

@@ -161,7 +161,7 @@ class RegionRefiner:
         """Return the rounds of optimisation around a pose, from coarse to fine.
 
         Raises:
-            UndecidedError: The part is not in view.
+            UndecidedError: The part is too small, outside the image or behind the camera.
         """
         K = np.asarray(K, np.float64)
         posed_mesh = posed(self.mesh, pose, K)

@@ -33,7 +33,7 @@ MIN_DEVIATION: Final = 0.3  # pixels; lower bound for the position of an edge at
 
 
 class Weights(NamedTuple):
-    """Weights of colours and edges."""
+    """Exponents of the likelihoods of colours and of edges along a normal."""
 
     colour: float  # exponent of a pixel's likelihood: neighbouring pixels are not independent
     edge: float  # exponent of an edge's likelihood: 1 + (change / mean change)²
@@ -71,7 +71,7 @@ def find_shifts(
         contour: Outline.
         reach: Search distance to each side, pixels.
         step: Distance between samples, pixels.
-        weights: Weights of colours and edges.
+        weights: Exponents of the likelihoods of colours and edges.
     """
     count = max(2, round(reach / step))
     changes = np.empty((len(contour), 2 * count + 2))
@@ -152,7 +152,7 @@ def _shifts(
         count: Number of samples to either side of a point.
         colour: Weight of the colours.
         edge: Weight of the edges.
-        shifts: Filled with mean (pixels) and information of each point.
+        shifts: Filled with mean (pixels) and information (pixels⁻²) of each point.
     """
     sums = np.empty(2 * count + 2)
     # The part may end between any two samples, before the first or after the last.
