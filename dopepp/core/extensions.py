@@ -87,7 +87,6 @@ def _enabled() -> list[str]:
 
 
 def _entries(group: str) -> tuple[EntryPoint, ...]:
-    """Return the entry points of a group in all installed packages."""
     return tuple(entry_points(group=f"dopepp.{group}"))
 
 

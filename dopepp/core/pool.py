@@ -125,7 +125,7 @@ class Pool(ABC):
     """Base of pools, which apply a pickled function to items in parallel; a context manager."""
 
     batch_size: int
-    """Recommended number of scenes to render per item. Small items lose little work when stopped;
+    """Recommended number of images to render per item. Small items lose little work when stopped;
     large items have less overhead."""
 
     def __enter__(self) -> Pool:

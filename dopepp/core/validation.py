@@ -229,7 +229,7 @@ def short_repr(value: object, max_length: int = 100) -> str:
 
 @cache
 def _adapter(kind: type[T]) -> TypeAdapter[T]:
-    # A class of an extension may have arguments that no plain value can represent.
+    # A class of an extension may have arguments that JSON cannot represent.
     config = None if dataclasses.is_dataclass(kind) else ConfigDict(arbitrary_types_allowed=True)
     return TypeAdapter(kind, config=config)
 

@@ -252,7 +252,7 @@ class PoseEstimator:
                 image size.
 
         Returns:
-            Detections, best score first, in metres and pixels of the given image. A refined
+            Detections, best score first, in metres and pixels of ``image``. A refined
             detection has the refined pose with its keypoints and covariance, and a score that
             belongs to refined poses. If refinement kept the network's pose, ``kept`` is the reason.
 
@@ -472,7 +472,7 @@ class PoseEstimator:
         return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
     def maps(self, image: RGBImage) -> Maps:
-        """Return belief maps and vector fields of an RGB image, padded as in :meth:`views`."""
+        """Return belief and field maps of an RGB image whose sides ``size_multiple`` divides."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():
             belief, field = self.network.maps(pixels)

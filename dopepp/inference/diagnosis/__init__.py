@@ -1,7 +1,7 @@
 """Diagnosis of missing or bad poses: one sentence and one fix per check.
 
 Parts are detected as by :meth:`PoseEstimator.predict` and in further image sizes, and detections
-are compared with the outlines on the image. Checks are in the order of causes: a wrong mesh or a
+are compared with the outlines on the image. Checks of causes come first: a wrong mesh or a
 blurred image affects all later checks. Thresholds were measured on rendered images with known
 faults (``benchmarks/doctor.py``).
 

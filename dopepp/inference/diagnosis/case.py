@@ -77,7 +77,7 @@ class Case:
 
     @cached_property
     def unexpected(self) -> list[Detection]:
-        """Detections centred more than half a part length (pixels) from every given centre."""
+        """Detections centred more than half a part length (pixels) from each of ``centres``."""
         return [
             detection
             for detection in self.reported

@@ -27,7 +27,7 @@ __all__ = ["CameraFrame", "FrameSource", "SourceLike", "open_sources"]
 
 SourceLike = str | Path | int | FrameSource
 """Path of an image, folder, video or ROS recording; glob pattern; camera number, device or URL; or
-an open source."""
+an opened frame source."""
 
 
 def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> list[FrameSource]:

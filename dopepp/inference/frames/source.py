@@ -78,7 +78,7 @@ def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> 
     """Return the camera that the user specified by K or by a camera (file), if any.
 
     Raises:
-        UserError: Both are given, or the camera file cannot be read.
+        UserError: Both K and a camera are specified, or the camera file cannot be read.
     """
     if K is not None and camera is not None:
         raise UserError("both --K and --camera", "only one of them", "leave out --K or --camera")

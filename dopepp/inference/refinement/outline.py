@@ -5,8 +5,7 @@ only the few edges on this border are filled, row by row. They cover the whole s
 closed mesh. In an open mesh, the triangles that face away are filled in the same way.
 
 An edge can belong to the outline if exactly one of its triangles faces the camera, or if it has one
-triangle only. The filled mask shows which of these edges do: the part ends there. Other edges have
-the part on both sides.
+triangle only. It belongs if the filled mask ends there, and not if the mask is on both sides.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ if TYPE_CHECKING:
 TERMS: Final = ("region", "depth")
 
 LOOSER: Final = 3.0
-"""Factor on the deviations of a network's pose. Its covariance was fitted to images like the
-training images; errors are larger on other images."""
+"""Factor on the standard deviations of a network's pose. Its covariance was fitted to images like
+the training images; errors are larger on other images."""
 
 FEW: Final = 4  # number of keypoints that determine a pose
 NUM_QUADRUPLES: Final = 40  # nine keypoints have 126 quadruples
@@ -90,7 +90,7 @@ class Refiner:
         scale_error: Largest relative error of the parts' size or of the focal length, 0 to 0.1.
 
     Raises:
-        UserError: There is no such term, or a part has no mesh.
+        UserError: A term is unknown, or a part has no mesh.
     """
 
     def __init__(

@@ -48,8 +48,8 @@ class Refinement:
     """Refined pose with its covariance, or the start pose and the reason why it was kept."""
 
     T_cam_obj: Transform
-    covariance: PoseMatrix | None = None  # see PnPResult; None if the given pose was kept
-    reason: str = ""  # why the given pose was kept; empty if it was refined
+    covariance: PoseMatrix | None = None  # see PnPResult; None if the start pose was kept
+    reason: str = ""  # why the start pose was kept; empty if it was refined
     agreement: float | None = None  # agreeing share of the image's information
     support: float | None = None  # share of the outline with agreeing information
 

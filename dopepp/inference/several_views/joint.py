@@ -37,7 +37,7 @@ WEAKER: Final = (0.5, 0.15)
 detection, and decrease of its agreement."""
 
 CONSISTENT: Final = 4.5
-"""Largest Mahalanobis distance of a joint pose from a detection that the image did not refine."""
+"""Largest Mahalanobis distance at which the covariances of two poses explain their difference."""
 
 AGAINST: Final = -1.5
 """Lower bound of a view's log odds, because the part may be occluded or hardly visible."""
@@ -225,7 +225,7 @@ class JointEstimator:
             for item in evidence
         )
         odds += COINCIDENCE * (max(len(observations), agreeing) - 1)
-        # The score of the best single view, with the odds of all views instead of its own.
+        # The score of the best single view, with the log odds of all views instead of this view's.
         score = _probability(log_odds(best.score) + self._slope * (odds - single_odds))
         covariance = np.linalg.inv(pose.information)
         given = best.object, score, _probability(odds), pose.T_cam_obj, covariance

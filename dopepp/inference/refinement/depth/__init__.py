@@ -39,7 +39,7 @@ from dopepp.inference.refinement.solver import (
 )
 
 FARTHEST: Final = 3.0
-"""Mahalanobis distance beyond which depth contradicts the image."""
+"""Mahalanobis distance from the prior's pose beyond which depth contradicts the image."""
 
 MIN_INLIERS: Final = 0.5  # share of the unobstructed points with depth that must agree
 MIN_SEEN: Final = 0.25  # share of the visible points that must have agreeing depth

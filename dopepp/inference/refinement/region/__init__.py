@@ -3,12 +3,12 @@
 1. Colours inside the part's outline and around it are learned at the pose to refine.
 2. Colours and edges along the normals of the outline show where the part ends
    (:mod:`~dopepp.inference.refinement.region.shifts`).
-3. A few Gauss–Newton steps follow, from coarse to fine, with the given pose and its covariance as
+3. A few Gauss–Newton steps follow, from coarse to fine, with the start pose and its covariance as
    prior. The last round is repeated until it converges.
 4. If the image does not agree with the result, the descent is repeated from other starts with a
    weaker prior, and the result that agrees best is returned. The covariance of a network's pose can
    be too small, for instance if the part is occluded.
-5. If the image does not determine the pose, the given pose is kept.
+5. If the image does not determine the pose, the start pose is kept.
 
 Errors of neighbouring points are correlated, and all points share errors of offset and scale
 (:mod:`~dopepp.inference.refinement.region.shared_errors`). If errors were independent, a blurred
@@ -61,11 +61,11 @@ SUPPORTED: Final = 0.35
 MORE: Final = 0.02
 
 FAR: Final = 3.0
-"""Additional deviations of the extended search, as multiples of the deviations of a pose without
+"""Additional standard deviations of the extended search, as multiples of those of a pose without
 covariance."""
 
 NUM_DRAWS: Final = 4  # poses that are sampled from the weaker prior in the extended search
-NUM_STARTS: Final = 4  # most likely starts that are tried besides the given pose
+NUM_STARTS: Final = 4  # most likely starts that are tried besides the start pose
 NUM_CONTINUED: Final = 2  # coarse results that the other stages continue
 
 CERTAIN: Final = 0.95  # agreement that ends the search
@@ -114,7 +114,7 @@ class RegionRefiner:
     ) -> Refinement:
         """Refine one pose; see :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
 
-        If the image does not agree with poses near the given pose, the search is extended to the
+        If the image does not agree with poses near ``T_cam_obj``, the search is extended to the
         poses that ``starts`` returns and to randomly sampled poses. Without ``starts``, the search
         is not extended.
         """
@@ -145,7 +145,7 @@ class RegionRefiner:
         visible = depth.visible(start.T_cam_obj)
         rounds = self.rounds(image, K, start.T_cam_obj, further_terms=[depth.term(visible)])
         reach = search_distance(rounds[0], Prior(start.T_cam_obj, start.information))
-        # Depth weighs more the nearer a pose is, so that the descent takes all rounds to converge.
+        # Depth gets more weight as its residuals shrink, so the descent needs all rounds.
         end = _descend(rounds, start.T_cam_obj, depth.prior, reach)
         information = depth.information(end.T_cam_obj, visible)
         return end, rounds[-1].check(end, depth.prior, reach, information)
@@ -227,11 +227,11 @@ def _search_far(
         prior: Distribution of the pose before the refinement.
         wide_prior: The same pose with larger standard deviations.
         starts: Further start poses; random poses from the wide prior are added.
-        nearby: Result of the search near the given pose, if any.
+        nearby: Result of the search near the prior's pose, if any.
 
     Returns:
         The result, or None if no result agrees well and has more support than ``nearby`` (without
-        ``nearby``: than the given pose).
+        ``nearby``: than the prior's pose).
     """
     best: Outcome | None = None
     given, first, last = prior.T_cam_obj, rounds[0], rounds[-1]
@@ -253,7 +253,7 @@ def _search_far(
         for coarse_end in coarse_ends[:NUM_CONTINUED]:
             with contextlib.suppress(UndecidedError):
                 end = _descend(rounds[1:], coarse_end, wide_prior, search_px).T_cam_obj
-                # The strongest prior under which this end is not surprising.
+                # Weaken the prior until this end is at the expected squared distance, 6.
                 factor = max(1.0, prior.squared_distance(end) / 6)
                 weakened_prior = Prior(given, prior.information / factor)
                 outcome = _refine([last], end, weakened_prior, search_px)

@@ -55,7 +55,7 @@ AGREE_PX: Final = 2.0  # largest distance from the image's outline of a point th
 INFORMATIVE: Final = 0.1  # pixels⁻²: information of a point that counts as support
 
 FARTHEST: Final = 4.5
-"""Largest Mahalanobis distance from the given pose (six numbers)."""
+"""Largest Mahalanobis distance of a refined pose from the prior's pose, in six dimensions."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ All points share two errors, which are unknowns with a prior:
 - Scale: a larger part or focal length has the same effect on the outline as a nearer part. All
   errors up to a limit are equally likely. The pose is corrected by the expected error: a precise
   prior keeps its distance while prior and outline differ by less than the limit, and a broad prior
-  leaves the distance to the outline. A normally distributed error would move every distance, even
+  lets the outline determine it. A normally distributed error would move every distance, even
   a correct one, part of the way to the outline's distance.
 
 Neighbouring points have errors in common, and outliers get a small weight.
