@@ -1,4 +1,4 @@
-"""The virtual-reality factory: from parts to labelled images, without torch and without files."""
+"""Synthetic data: images of parts in random scenes, rendered with labels and without torch."""
 
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
 from dopepp.virtual.body import Distractors

@@ -27,8 +27,8 @@ FLOOR: Final = 2.0  # gradient of noise, grey levels per pixel
 def agreement(image: RGBImage, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
     """Return the agreement of a part's outline and creases with an image, in [0, 1].
 
-    1 means that all edges lie on the contour. A part that is not in front of the camera, or has no
-    contour within the image, has agreement 0.
+    1 means that the strongest edge lies on the contour everywhere. A part that is not in front of
+    the camera, or has no contour within the image, has agreement 0.
     """
     if transform(T_cam_obj, surface.hull)[:, 2].min() <= NEAR:
         return 0.0
@@ -51,7 +51,7 @@ def agreement(image: RGBImage, K: CameraMatrix, T_cam_obj: Transform, surface: S
 def _contour(
     item: SceneObject, K: CameraMatrix, size: Size
 ) -> tuple[Float[np.ndarray, "points 4"], float]:
-    """Return x, y and normal of contour pixels in the image, and the part's extent, pixels."""
+    """Return (x, y, normal) of contour pixels and the longer side of the part's box, pixels."""
     projected = project_object(item, K)
     box = projected.box(size)
     if box is None:
@@ -71,7 +71,7 @@ def _contour(
 
 
 def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:
-    """Return the mask of pixels next to an outline, a step in depth or a crease."""
+    """Return the mask of pixels at the outline or where the normal turns by over 26°."""
     a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
@@ -80,14 +80,13 @@ def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:
     edges = np.zeros(ids.shape, bool)
     # Compare every pixel with its lower, then its right neighbour.
     for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        # Normals differ by over 26° at a crease.
         crease = (drawn[first] * drawn[second]).sum(axis=-1) < 0.9
         edges[first] |= crease & ((ids[first] >= 0) | (ids[second] >= 0))
     return edges
 
 
 def _normals(edges: Mask) -> Float[np.ndarray, "height width 2"]:
-    """Return unit normals of drawn lines: the main direction of their blurred structure tensor."""
+    """Return unit normals of lines in a mask: the main axis of the blurred structure tensor."""
     soft = cv2.GaussianBlur(edges.astype(np.float32), (0, 0), 1.0)
     gx, gy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
     xx, xy, yy = (cv2.GaussianBlur(g, (0, 0), 2.0) for g in (gx * gx, gx * gy, gy * gy))
@@ -98,7 +97,7 @@ def _normals(edges: Mask) -> Float[np.ndarray, "height width 2"]:
 def _profiles(
     image: RGBImage, contour: Float[np.ndarray, "points 4"], reach: int
 ) -> Float[np.ndarray, "points offsets"]:
-    """Return the squared gradient along the normals, from ``-reach`` to ``reach`` pixels."""
+    """Return squared gradients, (grey levels/pixel)², at −reach to reach pixels along normals."""
     # Blurred by a pixel against noise.
     soft = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     # Scharr's filter weighs 16 on each side, two pixels apart.

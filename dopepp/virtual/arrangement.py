@@ -35,7 +35,7 @@ _REDRAWS: Final = 25
 
 
 class Composition:
-    """Objects of a scene that satisfy a preset; ``negatives`` are possible distractors."""
+    """The accepted objects of one scene; ``negatives`` are parts that may be distractors."""
 
     def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
@@ -50,7 +50,7 @@ class Composition:
         self._preview = Preview(self.K, self.size, self.preset.min_visible_fraction)
 
     def draw_material(self, body: Body) -> Material:
-        """Sample a body's material; all instances of a part may share it."""
+        """Sample a material; instances of a part share it with probability ``alike_share``."""
         if body.part is None or not self._alike:
             return self.preset.materials.draw(self.rng, body.surface)
         name = body.part.name
@@ -59,12 +59,12 @@ class Composition:
         return self._materials[name]
 
     def draw_distractor(self, depth: float) -> Body:
-        """Sample a distractor for a depth in metres."""
+        """Sample a distractor with the preset's image size at a depth in metres."""
         width_at_depth = self.size[0] * depth / float(self.K[0, 0])
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
     def add(self, body: Body, T_cam_obj: Transform, material: Material) -> bool:
-        """Add a body if all targets stay visible enough; return whether the body was added."""
+        """Add a body if all targets then satisfy the preset; return whether it was added."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
             return False
@@ -75,7 +75,7 @@ class Composition:
         return True
 
     def _is_well_placed(self, item: SceneObject, extremes: Float[np.ndarray, "hull 3"]) -> bool:
-        """Return whether a target is large enough, inside the frame and within the depth range."""
+        """Return whether a target spans 2 pixels and its centroid is in the preset's ranges."""
         if item.part is None:
             return True
         middle = transform(item.T_cam_obj, item.part.cuboid[CENTROID])
@@ -86,12 +86,11 @@ class Composition:
             centre = project(middle, self.K)
             if not ((centre >= -0.5) & (centre < np.array(self.size) - 0.5)).all():
                 return False
-        # A target below two pixels is not recognisable.
         return bool(np.ptp(project(extremes, self.K), axis=0).max() >= 2.0)
 
 
 class Preview:
-    """A coarse depth image of the accepted objects."""
+    """Depth image of the accepted objects, at most 160 pixels wide, to measure visibility."""
 
     def __init__(self, K: CameraMatrix, size: Size, min_visible: float) -> None:
         scale = min(160 / size[0], 1.0)  # smaller images keep their size
@@ -104,9 +103,9 @@ class Preview:
         self._needed: list[float] = []
 
     def add(self, item: SceneObject) -> bool:
-        """Add an object if every target, itself included, stays visible enough.
+        """Add an object if every target then keeps its visible fraction; return whether added.
 
-        An object that reaches the camera or is far larger than the frame is refused.
+        An object that reaches the camera or spans over four image sides is not added.
         """
         projected, (width, height) = project_object(item, self._K), self._size
         left, top, right, bottom = projected.extent
@@ -144,8 +143,8 @@ def arrange_floating(
 ) -> float:
     """Place targets and distractors, and return the targets' mean depth, metres.
 
-    If the first target does not fit, no target is placed. Without targets, the depth is sampled
-    for the body ``reference_body``.
+    If the first target does not fit, no target is placed. Without targets, the depth is the sampled
+    depth of ``reference_body``.
     """
     for body in targets:
         material = composition.draw_material(body)
@@ -165,7 +164,7 @@ def arrange_floating(
 
 
 def _draw_pose(composition: Composition, body: Body) -> Transform:
-    """Sample a body's orientation and position from the preset."""
+    """Sample T_cam_obj from the preset's turning and placement."""
     preset, rng = composition.preset, composition.rng
     rotation = preset.turning.draw(rng)
     turned = body.surface.hull @ rotation.T
@@ -174,7 +173,7 @@ def _draw_pose(composition: Composition, body: Body) -> Transform:
 
 
 def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
-    """Yield candidate poses; position redraws keep the orientation."""
+    """Yield poses T_cam_obj; up to :data:`_REDRAWS` of them share an orientation."""
     while True:
         pose = _draw_pose(composition, body)
         for _ in range(_REDRAWS):
@@ -205,8 +204,7 @@ def _place_distractor(composition: Composition, reference: float) -> None:
 
 
 def _is_clear(composition: Composition, body: Body, T_cam_obj: Transform) -> bool:
-    """Return whether no target reaches into the core of a new object."""
-    # 60 % of the bounding sphere's radius counts as solid.
+    """Return whether all targets lie outside 60 % of the new object's bounding radius."""
     centre, core = T_cam_obj[:3, 3], 0.6 * body.surface.radius
     for target in composition.objects:
         distance = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))

@@ -1,7 +1,7 @@
 """Bodies: surfaces that a scene can contain, their convex hulls and stable faces, and distractors.
 
-To add a distractor shape, yield it from ``_solids`` or ``_profiles``. To add a part that must not
-be mistaken for a target, give it to the factory as a negative.
+To add a distractor shape, yield it from ``_solids`` or ``_profiles``. To add a part that a network
+must not confuse with a target, pass it to the factory as a negative.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
 
 WALL: Final = 0.03
-"""Thickness of a bin's walls, inner sides."""
+"""Thickness of a bin's walls over the side length of its interior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,9 @@ class Body:
     """A surface that can be posed.
 
     Attributes:
-        part: The part, if the network must detect it.
-        source: Original of a stretched body; ``stretch`` holds the factors along x, y and z.
+        part: The part, if the network must detect it; None for a distractor.
+        source: Original of a stretched body, None for other bodies.
+        stretch: Factors along the x, y and z axes of the source.
     """
 
     surface: Surface
@@ -66,7 +67,7 @@ class Body:
 
 
 def make_body(part: Part, *, is_target: bool) -> Body:
-    """Prepare a part's mesh for scenes.
+    """Return a part's body; ``is_target`` says whether the network must detect the part.
 
     Raises:
         UserError: The part has no mesh.
@@ -83,8 +84,8 @@ class Hull:
     """A body's convex hull and centre of mass.
 
     Attributes:
-        vertices: Object frame, metres; the lowest point of the body is always one of them.
-        facets: Number of each triangle's flat face.
+        vertices: Object frame, metres; in any orientation, the body's lowest point is one of them.
+        facets: Index of the flat face to which each triangle belongs.
         centre: Centre of mass of the solid body, object frame, metres.
     """
 
@@ -128,7 +129,7 @@ class Hull:
 
 
 def make_hull(surface: Surface) -> Hull:
-    """Compute a surface's hull and centre of mass (milliseconds; do it once per part)."""
+    """Return a surface's convex hull and centre of mass; takes milliseconds per part."""
     used = surface.vertices[np.unique(surface.faces)]
     try:
         hull = ConvexHull(used)
@@ -147,7 +148,7 @@ def make_hull(surface: Surface) -> Hull:
 
 
 def _facets(hull: ConvexHull) -> Int[np.ndarray, "triangles"]:
-    """Number the flat faces: neighbours whose normals differ by less than 0.05° share a number."""
+    """Return each triangle's flat face: neighbours with normals within 0.05° share an index."""
     normals = hull.equations[:, :3]
     cosine = np.cos(np.radians(0.05))
     numbers = np.full(len(normals), -1)
@@ -200,10 +201,10 @@ class Distractors(Checked):
     """Random objects around the targets.
 
     Attributes:
-        number: Number per image; objects that would hide too much of a target are omitted.
-        image_share: Diameter of a primitive's image.
-        depth: Depth of floating distractors; unused on a table.
-        lookalike_share: Probability that a distractor is a negative, if negatives exist.
+        number: Number per image; distractors that would hide too much of a target are omitted.
+        image_share: Diameter of a distractor shape in the image, image widths.
+        depth: Depth of floating distractors over the depth of the first target; unused on a table.
+        lookalike_share: Probability that a distractor is a negative part, if negatives exist.
         lookalike_scale: Size of a negative over its real size.
     """
 
@@ -232,7 +233,7 @@ def distractor_shapes() -> tuple[Body, ...]:
 
 
 def _solids() -> Iterator[Manifold]:
-    """Yield solids of any size and position."""
+    """Yield distractor shapes of arbitrary size and position."""
     yield Manifold.cube((1.0, 0.7, 0.5))
     yield Manifold.cube((1.0, 0.9, 0.15))
     yield Manifold.cylinder(1.0, 0.35, circular_segments=48)
@@ -263,7 +264,7 @@ def _profiles() -> Iterator[tuple[CrossSection, float]]:
 
 
 def _unit_surface(solid: Manifold) -> Surface:
-    """Centre a solid, scale its bounding sphere to radius 1 and prepare it."""
+    """Return the surface of a solid, centred and scaled to a bounding sphere of radius 1."""
     mesh = _mesh_of(solid)
     vertices = mesh.vertices - (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     vertices /= np.linalg.norm(vertices, axis=1).max()
@@ -271,7 +272,6 @@ def _unit_surface(solid: Manifold) -> Surface:
 
 
 def _mesh_of(solid: Manifold) -> Mesh:
-    """Convert a solid of the manifold library to a mesh."""
     mesh = solid.to_mesh()
     vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
     return Mesh(vertices, np.asarray(mesh.tri_verts, np.int32))

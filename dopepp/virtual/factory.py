@@ -1,9 +1,8 @@
-"""The factory: renders image ``(epoch, index)`` of an endless, reproducible supply.
+"""The factory: renders image ``(epoch, index)`` of an unlimited, reproducible sequence.
 
-A scale renders the same scene from closer or farther away (paper Fig. 11). The camera moves along
+``scale`` renders the same scene from closer or farther away (paper Fig. 11). The camera moves along
 the ray to the middle of the targets and keeps its orientation and lens. Objects, lamps and the
-plane stay in the world; ambient light and the background of floating objects are infinitely far
-away.
+plane do not move; ambient light and the background of floating objects are infinitely far away.
 """
 
 from __future__ import annotations
@@ -49,17 +48,17 @@ class Factory:
     bytes for the same (seed, epoch, index), in any order.
 
     Args:
-        parts: Targets, each with its own name.
+        parts: Targets, with distinct names.
         preset: Distribution of the scenes.
-        seed: At least 0.
-        backgrounds: Procedural by default.
-        renderer: Name of a renderer.
+        seed: Seed of all images, at least 0.
+        backgrounds: Source of background images (default: procedural textures).
+        renderer: Name of a renderer (:mod:`dopepp.virtual.renderers`).
         negatives: Parts to show among the distractors, so that a network learns to reject them;
             built-in parts that are not targets are always added.
 
     Raises:
-        UserError: There is no part, a part has no mesh, two share a name, a negative is a target
-            (by name or mesh), or the seed is negative.
+        UserError: There is no part, a part has no mesh, two parts share a name, a negative has the
+            name or mesh of a target, or the seed is negative.
     """
 
     def __init__(
@@ -96,9 +95,9 @@ class Factory:
             epoch: Epoch of the image.
             index: Index of the image within the epoch.
             scale: Magnification of the targets, relative to the preset.
-            view: Number of the camera of the static scene; 0 is the preset's camera. Other
-                cameras look at the middle of the targets from :data:`BESIDE_DEG` beside the
-                preset's camera, and from above the table.
+            view: Index of the camera of the static scene; 0 is the preset's camera. Other cameras
+                are turned by :data:`BESIDE_DEG` about the middle of the targets and stay above
+                the table.
 
         Raises:
             UserError: The preset cannot show the part, or the camera would be below the table.
@@ -179,14 +178,14 @@ def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
     """Return the shift of the world in the camera frame, metres, for a magnification > 0.
 
     The distance from the camera to the mean of the targets' centres is divided by ``scale``;
-    without a target the camera stays.
+    without a target, the shift is 0.
     """
     middle = _middle(objects)
     return np.zeros(3) if middle is None or scale == 1 else np.asarray((1 / scale - 1) * middle)
 
 
 def _draw_camera(scene: Scene, rng: Generator) -> Transform:
-    """Sample the pose of a further camera of a static scene, T_new_cam."""
+    """Sample T_new_cam of a further camera, turned by :data:`BESIDE_DEG` about the targets."""
     angle, first = np.radians(rng.uniform(*BESIDE_DEG)), rng.uniform(0.0, 2 * np.pi)
     middle = _middle(scene.objects)
     point = np.array([0.0, 0.0, 1.0]) if middle is None else middle
@@ -201,26 +200,26 @@ def _draw_camera(scene: Scene, rng: Generator) -> Transform:
 
 
 def _middle(objects: Sequence[SceneObject]) -> Vector | None:
-    """Return the mean of the targets' centres; None without a target."""
+    """Return the mean of the targets' cuboid centres, camera frame, metres; None without target."""
     pairs = [(item.T_cam_obj, item.part) for item in objects if item.part is not None]
     centres = [transform(T_cam_obj, part.cuboid[CENTROID]) for T_cam_obj, part in pairs]
     return np.mean(centres, axis=0) if centres else None
 
 
 def _in_front(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
-    """Return the objects that the camera has not reached or passed."""
+    """Return the objects that lie entirely beyond ``NEAR`` in front of the camera."""
     hulls = (transform(item.T_cam_obj, item.surface.hull) for item in objects)
     return tuple(item for item, hull in zip(objects, hulls, strict=True) if hull[:, 2].min() > NEAR)
 
 
 def _shift(T_cam: Transform, shift: Vector) -> Transform:
-    """Return a pose shifted by a vector."""
+    """Return a pose shifted by a vector in the camera frame, metres."""
     return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)
 
 
 @cache
 def code_hash() -> str:
-    """Return a SHA-256 of the rendering code; cached renders of other code are not reused."""
+    """Return a SHA-256 of the rendering code; a cache of renders from other code is not reused."""
     digest = hashlib.sha256()
     for folder in _FOLDERS:
         for path in sorted((_PACKAGE / folder).rglob("*.py")):
@@ -229,7 +228,7 @@ def code_hash() -> str:
 
 
 def _collect_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
-    """Return the given negatives and the built-in parts that are neither targets nor given."""
+    """Return ``given`` and the built-in parts whose names and meshes are not in either argument."""
     names, hashes = {part.name for part in parts}, {part.mesh_hash for part in parts}
     for part in given:
         if part.name in names or part.mesh_hash in hashes:

@@ -36,14 +36,14 @@ Sides = Float[np.ndarray, "3"]  # inner width, depth and height of a bin, metres
 def arrange_heap(
     composition: Composition, table: Table, pile: Pile, targets: Sequence[Body], drawing: Generator
 ) -> Transform:
-    """Drop targets and distractors, and choose a view.
+    """Add a heap of targets and distractors to a composition, and sample a view of the heap.
 
     Args:
-        composition: Receives the objects, with the randomness of the image.
+        composition: Composition of the image; its generator samples the view and materials.
         table: Distribution of the views.
         pile: Distribution of the heaps.
         targets: Targets of the heap.
-        drawing: Randomness of the heap.
+        drawing: Generator of the heap's objects and poses.
 
     Returns:
         T_cam_table (plane z = 0, z up). Without a view that shows a target, no object is added.
@@ -94,7 +94,7 @@ def arrange_heap(
 def _drop(
     bodies: Sequence[Body], pile: Pile, diameter: float, rng: Generator
 ) -> tuple[Sequence[Transform], Sides | None]:
-    """Return the bodies' poses at rest, and the sides of their bin, if any."""
+    """Return the bodies' poses T_table_obj at rest, and the sides of their bin or None."""
     from dopepp.virtual.physics import settle  # needs the extra ``robot``
 
     if not bodies:
@@ -121,7 +121,7 @@ def _drop(
 def _layers(
     bodies: Sequence[Body], sides: Sides, diameter: float, rng: Generator
 ) -> Float[np.ndarray, "bodies 4 4"]:
-    """Return poses in layers above the drop area: random rotations, without contact."""
+    """Return random poses T_table_obj without contact, in layers above the drop area."""
     most = np.maximum((sides[:2] / diameter).astype(int), 1)
     top, poses = 0.0, []
     free: list[list[int]] = []

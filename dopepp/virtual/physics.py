@@ -55,7 +55,7 @@ _FLOOR, _HULL, _PIECES = 1, 2, 4  # collision groups
 
 
 def add_hull(spec: Any, body: Any, name: str, vertices: Piece) -> Any:
-    """Add a convex hull to a body, and return the geom; geoms of one name share a mesh."""
+    """Add a convex hull to a MuJoCo body and return its geom; geoms of one name share a mesh."""
     if spec.mesh(name) is None:
         faces = hull_faces(ConvexHull(vertices))
         spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
@@ -70,13 +70,13 @@ def settle(
     Results are cached on disk under a hash of all arguments.
 
     Args:
-        solids: Convex pieces of every solid, its own frame, metres.
-        starts: Initial poses, without overlaps, metres.
-        walls: Immovable convex pieces, metres.
+        solids: Convex pieces of every solid, object frame, metres.
+        starts: Initial poses (object to world, metres) without overlaps.
+        walls: Immovable convex pieces, world frame, metres.
         diameter: Diameter of the largest solid, metres.
 
     Returns:
-        Poses, or None if the solids do not come to rest, or overlap by more than
+        Poses like ``starts``, or None if the solids do not come to rest, or overlap by more than
         :data:`MAX_OVERLAP`.
 
     Raises:
@@ -140,7 +140,7 @@ def _simulate(
 
 
 def _vertex_positions(poses: Poses, vertices: Sequence[Piece]) -> Float[np.ndarray, "vertices 3"]:
-    """Return the vertices of all solids at their poses."""
+    """Return the vertices of all solids in the world frame."""
     pairs = zip(poses, vertices, strict=True)
     return np.concatenate([transform(pose, solid) for pose, solid in pairs])
 
@@ -152,7 +152,7 @@ def _hull(solid: tuple[Piece, ...]) -> Piece:
 
 
 def _model(solids: Sequence[tuple[Piece, ...]], walls: Sequence[Piece], scale: float) -> Any:
-    """Return the model of a floor, walls and free solids.
+    """Return the MuJoCo model of a floor, walls and free solids, multiplied by ``scale``.
 
     Only pieces collide with pieces and walls, and only hulls collide with the floor: a hull touches
     a plane where its pieces do, at a tenth of the contacts.

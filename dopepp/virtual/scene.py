@@ -1,4 +1,4 @@
-"""A scene: objects, materials, lights, background and sensor of one image, and its render."""
+"""A scene: objects, materials, lights, background and sensor of one image; the rendered image."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def triple(values: Iterable[float]) -> Triple:
 
 @dataclass(frozen=True)
 class Grooves:
-    """Fine parallel grooves that tilt a surface's normal: layer lines of a print, brushed metal.
+    """Fine parallel grooves that tilt a surface's normal: layer lines of 3D prints, brushed metal.
 
     Attributes:
         axis: Unit vector across the grooves, object frame.
@@ -59,7 +59,7 @@ class Material:
         specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
         metallic: 1 for a metal, which has no diffuse light and reflects its colour.
         noise: Relative amplitude of the albedo's noise, clipped to :data:`NOISE_LIMITS`.
-        noise_pitch: Size of the noise, metres.
+        noise_pitch: Distance between the lattice points of the noise, metres.
     """
 
     colour: Triple = (0.6, 0.6, 0.6)
@@ -76,6 +76,7 @@ class Light:
     """A point light.
 
     Attributes:
+        position: Camera frame, metres.
         intensity: Linear RGB that a white surface facing the light shows at ``reach``.
         reach: Distance at which a surface has this intensity, metres (inverse-square law).
     """
@@ -101,7 +102,7 @@ class Ambient:
 class Plane:
     """An unbounded supporting plane, the table.
 
-    The scene's background shows the plane; renderers add shadows. A plane is not an instance.
+    The scene's background image shows the plane; renderers add the shadows of objects.
 
     Attributes:
         normal: Unit normal on the camera's side, camera frame.
@@ -112,17 +113,13 @@ class Plane:
     offset: float
 
     def inverse_depth_row(self, K: CameraMatrix) -> Vector:
-        """Return (a, b, c) with 1/z = a u + b v + c on the plane, 1/m; positive if in front."""
+        """Return (a, b, c): the plane's point at pixel (u, v) has depth 1/(a u + b v + c) m."""
         return np.asarray(np.linalg.solve(K.T, np.array(self.normal, np.float64)) / self.offset)
 
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """One posed object.
-
-    Attributes:
-        part: Part of a target; None for a distractor.
-    """
+    """A surface with its pose and material; ``part`` is None for a distractor."""
 
     surface: Surface
     T_cam_obj: Transform
@@ -160,7 +157,7 @@ class Scene:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) in pixels."""
+        """(width, height) of the image, pixels."""
         return self.background.shape[1], self.background.shape[0]
 
     @property
@@ -171,11 +168,11 @@ class Scene:
     def seen_from(self, T_new_cam: Transform) -> Scene:
         """Return the static scene in another camera with the same lens and sensor.
 
-        The background is the plane's image, or infinitely far away; beyond its border it is
-        reflected.
+        The background is warped as the plane's image or, without a plane, as an infinitely distant
+        image; pixels that it does not cover are filled by reflection at its border.
 
         Args:
-            T_new_cam: Transform from this camera into the other, metres.
+            T_new_cam: Transform from this camera to the other, metres.
         """
         R, shift = T_new_cam[:3, :3], T_new_cam[:3, 3]
         homography, plane = R, self.plane
@@ -220,7 +217,7 @@ class Rendered:
     Attributes:
         depth: Metres along z at pixel centres, float32; 0 on the background.
         instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
-        visible_fractions: Visible share of every object's whole silhouette.
+        visible_fractions: Visible share of each object's silhouette on an unbounded canvas.
     """
 
     image: RGBImage

@@ -30,11 +30,11 @@ Cell = tuple[int, int]  # x and y
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Choose a view of the table, and add targets and distractors.
+    """Sample a view of the table, and add targets and distractors to a composition.
 
     Args:
-        composition: Receives the objects, with the randomness of the image.
-        table: Distribution of the views.
+        composition: Composition of the image, whose generator is used.
+        table: Distribution of the views and resting poses.
         targets: Targets of the image.
 
     Returns:
@@ -58,7 +58,7 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
 
 @dataclass(frozen=True, eq=False)
 class _RestingPose:
-    """A resting pose; ``height`` (lowest point) and ``centre`` (of mass) are above the plane."""
+    """A resting pose, with the heights of its lowest point and its centre of mass, metres."""
 
     T_table_obj: Transform
     footprint: Footprint
@@ -83,7 +83,7 @@ class _TableScene:
         self._inverse_depth = plane_of(self.T_cam_table).inverse_depth_row(composition.K)
 
     def place(self, body: Body) -> bool:
-        """Lay a body down; return whether it fits."""
+        """Add a body in a sampled resting pose; return whether a pose was accepted."""
         material = self.composition.draw_material(body)
         for _ in range(6):  # random orientations, until the body fits
             for pose in self._candidates(body):
@@ -94,7 +94,7 @@ class _TableScene:
         return False
 
     def _candidates(self, body: Body) -> Iterable[_RestingPose]:
-        """Sample resting poses of a body; on a heap, the lowest first."""
+        """Sample resting poses of a body; on a heap, in order of the centre of mass's height."""
         if not self.table.heaped:
             return self._resting_poses(body)
         # Objects slide down: prefer the lowest pose of two orientations.
@@ -102,7 +102,7 @@ class _TableScene:
         return sorted(several, key=lambda pose: pose.centre)
 
     def _resting_poses(self, body: Body) -> Iterator[_RestingPose]:
-        """Turn a body at random and yield resting poses."""
+        """Sample an orientation of a body, and yield resting poses at sampled points."""
         rotation, lowest = self.table.draw_turning(self.rng, body.hull)
         footprint = self._map.footprint(body.surface, rotation, lowest)
         if footprint is None:
@@ -122,7 +122,7 @@ class _TableScene:
             yield _RestingPose(make_transform(rotation, origin), footprint, cell, height, centre)
 
     def _draw_point(self) -> tuple[float, float] | None:
-        """Sample a point of the table, metres: in the heap's circle, or under a random pixel."""
+        """Sample (x, y) on the table, metres: in the heap's circle, or at a random pixel."""
         rng = self.rng
         if self.table.heaped:
             # The root makes the points uniform over the circle's area.
@@ -169,7 +169,7 @@ class Footprint:
 
 
 class HeightMap:
-    """Heights of the objects on the table, for x and y from −``reach`` to ``reach``, metres."""
+    """Height of the objects above the table per square cell, x and y within ±``reach`` metres."""
 
     def __init__(self, cell: float, reach: float) -> None:
         self.cell = cell
@@ -209,9 +209,9 @@ class HeightMap:
         )
 
     def height(self, footprint: Footprint, cell: Cell) -> float | None:
-        """Return the height of the lowest point at rest, metres; None beyond the map.
+        """Return the height of the object's lowest point at rest, metres; None beyond the map.
 
-        ``cell`` is the x and y of the object's origin.
+        ``cell`` is the position of the object's origin, in cells.
         """
         rows, columns = window = self._window(footprint, cell)
         if min(rows.start, columns.start) < 0 or max(rows.stop, columns.stop) > len(self._heights):
@@ -219,17 +219,17 @@ class HeightMap:
         return max(float((self._heights[window] - footprint.bottom).max()), 0.0)
 
     def put(self, footprint: Footprint, cell: Cell, height: float) -> None:
-        """Set an object down at the height from :meth:`height`."""
+        """Raise the map to the top of an object that rests at the result of :meth:`height`."""
         window = self._window(footprint, cell)
         np.maximum(self._heights[window], footprint.top + height, out=self._heights[window])
 
     def is_free(self, footprint: Footprint, cell: Cell) -> bool:
-        """Return whether no object lies under or over a footprint placed at this cell."""
+        """Return whether the map is empty under a footprint with the origin at ``cell``."""
         window = self._window(footprint, cell)
         return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
 
     def _window(self, footprint: Footprint, cell: Cell) -> tuple[slice, slice]:
-        """Return the slices of the map's cells under a footprint placed at a cell."""
+        """Return the map's rows and columns under a footprint with the origin at ``cell``."""
         rows, columns = footprint.top.shape
         left = cell[0] + footprint.corner[0] + self._half
         top = cell[1] + footprint.corner[1] + self._half
@@ -239,9 +239,10 @@ class HeightMap:
 def _greatest(
     x: Column, y: Column, values: Column, surface: Surface, faces: Faces, corner: Cell, shape: Shape
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return 1 + the greatest value (in [0, 1] per vertex) at cell centres; 0 outside the object.
+    """Return 1 + the greatest interpolated value at each cell's centre; 0 outside the object.
 
-    ``x`` and ``y`` are columns and rows of the vertices; ``corner`` is the map's first cell.
+    ``values``, in [0, 1], belong to vertices at columns ``x`` and rows ``y``; ``corner`` is the
+    (column, row) of the first cell.
     """
     # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image. A vertex at
     # column x and row y with z = 1/(1 + value) therefore maps any linear value in [0, 1].

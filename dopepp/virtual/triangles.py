@@ -1,6 +1,6 @@
 """Compiled rasterisation of triangles: the nearest triangle and inverse depth of every sample.
 
-Baking, arranging, rendering and shadow maps share these functions.
+Ambient occlusion, scene composition, rendering and shadow maps share these functions.
 
 Visibility uses homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D
 homogeneous coordinates", 1997): with the projected vertices ``p = K x_cam`` of a triangle,
@@ -38,7 +38,7 @@ _pool = threading.local()
 
 @compiled()
 def project_vertices(vertices: Array, T_cam_obj: Array, K: Array, cam: Array, hom: Array) -> None:
-    """Fill ``cam`` with vertices in the camera frame, and ``hom`` with the pixels ``K x_cam``."""
+    """Fill ``cam`` with vertices in the camera frame, metres, and ``hom`` with ``K x_cam``."""
     for i in range(vertices.shape[0]):
         x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
         for r in range(3):
@@ -52,7 +52,7 @@ def project_vertices(vertices: Array, T_cam_obj: Array, K: Array, cam: Array, ho
 
 @compiled()
 def bounds(hom: Array, near: float) -> tuple[float, float, float, float]:
-    """Return (left, top, right, bottom) of projected vertices; infinite across the near plane."""
+    """Return (left, top, right, bottom) of vertices, pixels; infinite across depth ``near``."""
     left, top, right, bottom = math.inf, math.inf, -math.inf, -math.inf
     in_front, behind = False, False
     for i in range(hom.shape[0]):
@@ -71,7 +71,7 @@ def bounds(hom: Array, near: float) -> tuple[float, float, float, float]:
 
 @compiled(inline="always")
 def _narrow(first: int, last: int, x0: int, slope: float, least: float) -> tuple[int, int]:
-    """Narrow a row's columns to those with ``slope·x >= least``, rounded outwards."""
+    """Narrow the columns ``first`` to ``last`` to those with ``slope·(column + x0) >= least``."""
     if slope > 0.0:
         # Beyond the window's columns the integer conversion could overflow.
         edge = min(least / slope - x0, last + 1.0)
@@ -94,12 +94,12 @@ def rasterise(
     ids: Array,
     first_id: int,
 ) -> None:
-    """Draw triangles into a sample buffer of inverse depth (1/m, 0 = empty) and triangle ids.
+    """Draw triangles into buffers of the nearest inverse depth (1/m, 0 = empty) and triangle id.
 
     Args:
         hom: Homogeneous pixels of the vertices, shape (V, 3).
         faces: Triangles.
-        cull: Whether to drop back faces (watertight meshes only).
+        cull: Whether to omit back faces (watertight meshes only).
         near: Smallest depth of a sample, metres.
         origin: Pixel (x, y) of the buffers' first element.
         samples: Offsets of a pixel's samples from its centre, at most 1/4, shape (S, 2).
@@ -227,7 +227,7 @@ def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> S
 
 @compiled(fastmath=True)
 def lit_share(x: Scalar, y: Scalar, z: Scalar, inverse_depth: Array, P: Array) -> Scalar:
-    """Return the share of light that reaches a point; ``P`` (3, 4) projects into the shadow map."""
+    """Return :func:`open_share` at a point that ``P`` (3, 4) projects into the shadow map."""
     depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     if depth <= _ZERO:
         return _ONE
