@@ -1,4 +1,4 @@
-"""The sensor: exposure, lens blur, noise and compression of an ideal image; sRGB and tone curve.
+"""The camera sensor: exposure, blur, noise and compression of an ideal image; sRGB, tone curve.
 
 To add an effect, write a function, add its parameter to :class:`Sensor` and its probability and
 range to :class:`Sensors`, and call it in :func:`capture` (order: exposure, lens, chip, file).
@@ -34,10 +34,12 @@ class Sensor:
 
     Attributes:
         exposure_ev: Exposure in stops; 1 doubles the light.
+        blur_px: Standard deviation of the defocus blur, pixels.
         motion_px: Displacement (x, y) of the image during the exposure, pixels.
         read_noise: Standard deviation of signal-independent noise, grey levels of 255.
-        shot_noise: Standard deviation of signal-dependent noise at white; proportional to the
-            square root of the signal.
+        shot_noise: Standard deviation of noise that grows with the square root of the signal, at
+            white, grey levels.
+        jpeg_quality: JPEG quality, 1 to 100; None for no compression.
     """
 
     exposure_ev: float = 0.0
@@ -55,16 +57,16 @@ class Sensors(Checked):
 
     Attributes:
         exposure_probability: Probability of a wrong exposure.
-        exposure_ev: Exposure; 1 doubles the light.
+        exposure_ev: Exposure in stops; 1 doubles the light.
         blur_probability: Probability of defocus blur.
-        blur_px: Standard deviation of the blur; it scales with the preset's image size.
+        blur_px: Standard deviation of the blur, pixels; scales with the preset's image size.
         motion_probability: Probability of motion blur.
-        motion_px: Displacement during the exposure; it scales with the preset's image size.
+        motion_px: Displacement during the exposure, pixels; scales with the preset's image size.
         noise_probability: Probability of noise.
-        read_noise: Standard deviation of signal-independent noise.
-        shot_noise: Standard deviation of signal-dependent noise at white.
+        read_noise: Standard deviation of signal-independent noise, grey levels.
+        shot_noise: Standard deviation of signal-dependent noise at white, grey levels.
         jpeg_probability: Probability of JPEG compression.
-        jpeg_quality: Quality of the JPEG compression.
+        jpeg_quality: JPEG quality, 1 to 100.
     """
 
     exposure_probability: Probability = 0.5
@@ -80,7 +82,7 @@ class Sensors(Checked):
     jpeg_quality: Annotated[tuple[int, int], Span(1, 100, "JPEG quality")] = (70, 95)
 
     def resized(self, scale: float) -> Sensors:
-        """Return the same camera for images scaled by a factor."""
+        """Return the distribution for scaled images, with both blurs multiplied by ``scale``."""
         blur, motion = ((scale * low, scale * high) for low, high in (self.blur_px, self.motion_px))
         return replace(self, blur_px=blur, motion_px=motion)
 
@@ -124,7 +126,7 @@ def capture(image: RGBImage, sensor: Sensor) -> RGBImage:
 
 
 def defocus(image: RGBImage, sigma_px: float) -> RGBImage:
-    """Blur with a Gaussian of a standard deviation in pixels."""
+    """Blur an image with a Gaussian of standard deviation ``sigma_px``."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px))
 
 
@@ -161,7 +163,7 @@ def _exposure_curve(exposure_ev: float) -> UInt8[np.ndarray, "256"]:
 
 
 def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:
-    """Return the kernel of a line through the middle, its points spread over the four nearest."""
+    """Return the kernel of motion by (x, y) pixels: a line whose points spread over four cells."""
     half = math.ceil(max(abs(x), abs(y)) / 2)
     kernel = np.zeros((2 * half + 2, 2 * half + 2))
     # Four points per pixel make the line even; an odd number keeps a point in the middle.
@@ -178,7 +180,7 @@ def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:
 
 @cache
 def _normal_values() -> Float32[np.ndarray, "values"]:
-    """Return shuffled quantiles of the standard normal distribution."""
+    """Return shuffled quantiles of the standard normal distribution, the first ones repeated."""
     # The start is repeated at the end, so that a run may start anywhere.
     normal = NormalDist()
     quantiles = [normal.inv_cdf((k + 0.5) / _NOISE_VALUES) for k in range(_NOISE_VALUES)]
@@ -189,7 +191,7 @@ def _normal_values() -> Float32[np.ndarray, "values"]:
 
 @compiled()
 def _shuffle(values: Array) -> None:
-    """Shuffle in place (Fisher and Yates) by the hash, in the same order on every platform."""
+    """Shuffle in place (Fisher and Yates) by :func:`_mix_bits`, identically on all platforms."""
     for i in range(values.shape[0] - 1, 0, -1):
         k = _mix_bits(np.uint32(i)) % np.uint32(i + 1)
         values[i], values[k] = values[k], values[i]

@@ -1,7 +1,7 @@
 """Presets: named, typed distributions of random scenes.
 
-A preset is a YAML file in ``conf/virtual/preset`` or of the user. :func:`preset_of` changes fields
-by plain values, as a config gives them; in code, use :func:`dataclasses.replace`, or
+A preset is a YAML file, shipped in ``conf/virtual/preset`` or written by a user. :func:`preset_of`
+changes fields by values of a config; in code, use :func:`dataclasses.replace`, or
 :meth:`Preset.resized` and :meth:`Preset.reframed` for the size. To add a preset, add a file.
 """
 
@@ -47,7 +47,7 @@ class Preset(Checked):
 
     Attributes:
         name: Name in messages and records.
-        width, height: Image size.
+        width, height: Image size, pixels.
         horizontal_fov_deg: Horizontal field of view of a camera with square pixels and a centred
             principal point; ignored if ``intrinsics_px`` is given.
         intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.
@@ -57,11 +57,11 @@ class Preset(Checked):
             are left out. On images without targets, a network learns to detect nothing.
         min_visible_fraction: Smallest visible fraction of every target.
         centroid_inside: Whether the image must contain every target's cuboid centre.
-        window: (width, height) of the rendered part of the image, around a random point; None
-            renders the whole image.
-        depths: Smallest and largest depth of the targets' cuboid centres; None for any.
-        clutter: Number of flat pieces of other images on the background.
-        background_contrast: Factor on the background's contrast.
+        window: (width, height) in pixels of the rendered part of the image, around a random point;
+            None renders the whole image.
+        depths: Smallest and largest depth of the targets' cuboid centres, metres; None for any.
+        clutter: Smallest and largest number of pieces of other images pasted on the background.
+        background_contrast: Smallest and largest factor on the background's contrast.
 
     Raises:
         UserError: The camera is implausible, or a pile is combined with ``min_visible_fraction``,
@@ -142,18 +142,18 @@ class Preset(Checked):
         return self._with_camera(K, width, height, scale)
 
     def _with_camera(self, K: CameraMatrix, width: int, height: int, scale: float) -> Preset:
-        """Return the preset for another camera, with pixels ``scale`` times as fine."""
+        """Return the preset for another camera, with the sensor's blurs multiplied by ``scale``."""
         sensors, intrinsics = self.sensors.resized(scale), intrinsics_of(K)
         return replace(self, width=width, height=height, sensors=sensors, intrinsics_px=intrinsics)
 
 
 def intrinsics_of(K: CameraMatrix) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx and cy of a camera matrix."""
+    """Return fx, fy, cx and cy of a camera matrix, pixels."""
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 class _Presets(Mapping[str, Preset]):
-    """The shipped presets, read on access."""
+    """The shipped presets by name; a preset's file is read on access."""
 
     def __getitem__(self, name: str) -> Preset:
         return preset_of(name)
@@ -219,7 +219,7 @@ def _read_shipped(name: str) -> Any:
 
 
 def _merge(values: Any, changes: Any) -> Any:
-    """Change fields of nested mappings; a group of another kind replaces the whole group."""
+    """Return nested mappings with fields changed; a group of another kind replaces the group."""
     if not isinstance(values, dict) or not isinstance(changes, dict):
         return changes
     if changes.get("kind", values.get("kind")) != values.get("kind"):

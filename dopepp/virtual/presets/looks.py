@@ -1,7 +1,7 @@
 """Distributions of materials (plastics, 3D prints, plain and brushed metals) and of lights.
 
 To add a kind of material or light, add its share and ranges to :class:`Materials` or
-:class:`Lighting`, and draw it in ``draw``.
+:class:`Lighting`, and sample it in ``draw``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _GREY_CAST: Final = 0.05  # largest relative deviation of a channel: real greys 
 
 @dataclass(frozen=True)
 class Materials(Checked):
-    """Ranges of materials; textured and coloured surfaces keep their colours.
+    """Ranges of materials; surfaces with a texture or vertex colours keep their colours.
 
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
@@ -43,15 +43,15 @@ class Materials(Checked):
         texture_noise: Relative amplitude of noise on coloured surfaces, for stains and openings
             that are missing in the model.
         noise: Relative amplitude of noise on the albedo of an untextured surface.
-        noise_pitch: Size of the noise over the object's radius.
+        noise_pitch: Distance between the noise's lattice points over the object's radius.
         metal_share: Share of untextured surfaces that are bare metal.
         metal_albedo: Reflectance of metals at normal incidence.
         metal_roughness: Roughness of metals.
         brushed_share: Share of metals with brush marks.
-        brush_pitch: Mean distance of the marks on brushed metals.
+        brush_pitch: Mean distance of the marks on brushed metals, metres.
         brush_slope: Largest slope of a mark's flanks, the tangent of the normal's tilt.
         print_share: Share of untextured dielectrics that are 3D prints with layer lines.
-        layer_pitch: Height of a print's layers.
+        layer_pitch: Height of a print's layers, metres.
         layer_slope: Largest slope of the layers' flanks, as ``brush_slope``.
         alike_share: Probability that all instances of a part in an image share a material.
     """
@@ -128,7 +128,7 @@ class Materials(Checked):
 
 
 def _grey(rng: Generator, brightness: float) -> Triple:
-    """Sample a nearly grey colour."""
+    """Sample a linear RGB whose channels are within 5 % of ``brightness``."""
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 
@@ -159,14 +159,14 @@ class Lighting(Checked):
     """Ranges of light; an intensity is the radiance of a white surface that faces the light.
 
     Attributes:
-        num_lights: Number of point lights; the first, the key light, casts the sharpest shadows.
+        num_lights: Number of point lights; the first is the key light.
         key_intensity: Intensity of the key light.
         fill_intensity: Intensity of the other point lights.
         ambient_intensity: Intensity of the ambient light.
         max_angle_deg: Largest angle at the scene between a light and the camera (or, over a plane,
             the plane's normal); 0 is a flash light on the camera.
-        distance: Distance of a light from the scene.
-        temperature_k: Colour temperature at a white balance of 6500 K; low is warm.
+        distance: Distance of a light from the scene's centre, camera distances.
+        temperature_k: Colour temperature at a white balance of 6500 K; low is reddish.
         tint: Largest relative deviation of a colour channel from the lamp's colour.
         ground_share: Ratio of the light from below to the light from above.
     """
@@ -185,9 +185,9 @@ class Lighting(Checked):
     def draw(
         self, rng: Generator, centre: Vector, normal: Vector | None = None
     ) -> tuple[tuple[Light, ...], Ambient]:
-        """Sample the ambient light and point lights around ``centre``, camera frame, metres.
+        """Sample point lights around ``centre`` (camera frame, metres) and the ambient light.
 
-        ``normal`` is the normal of the supporting plane; None without a plane.
+        ``normal`` is the unit normal of the supporting plane; None without a plane.
         """
         towards = np.array([0.0, 0.0, -1.0]) if normal is None else normal
         far = float(np.linalg.norm(centre))

@@ -116,7 +116,7 @@ def looking_down(elevation: float) -> RotationMatrix:
 
 
 class _Placement(Checked):
-    """Base of the placements."""
+    """Base of the placements; a placement samples an object's origin in the camera frame."""
 
     _ends: ClassVar[tuple[str, str] | None] = None  # names of the smallest and largest value
 
@@ -131,10 +131,10 @@ class _Placement(Checked):
             raise UserError(problem, f"{first} <= {last}", f"lower {first}, or raise {last}")
 
     def redraw(self, rng: Generator, position: Vector) -> Vector | None:
-        """Return another position for an object that is not well visible, or None.
+        """Return another position (camera frame, metres) after ``position`` was rejected, or None.
 
-        Coordinates that a placement keeps retain their distribution for any number of rejections.
-        After None, the caller samples a new orientation too.
+        A coordinate that is the same in both positions keeps its distribution for any number of
+        rejections. After None, the caller samples a new orientation too.
         """
         return None
 
@@ -147,9 +147,9 @@ class OffsetPlacement(_Placement):
     orientations therefore keep their uniform distributions.
 
     Attributes:
-        distance: Depth of the box's middle.
-        axial: Largest offset along the optical axis to either side.
-        lateral: Largest offset along image x and along image y to either side.
+        distance: Depth of the box's middle, metres.
+        axial: Largest offset along the optical axis to either side, metres.
+        lateral: Largest offset along image x and along image y to either side, metres.
 
     Raises:
         UserError: ``axial`` is not below ``distance``.
@@ -175,7 +175,7 @@ class OffsetPlacement(_Placement):
         return np.array([x, y, self._draw_depth(rng)])
 
     def redraw(self, rng: Generator, position: Vector) -> Vector:
-        """Return the same lateral offsets at another depth, metres."""
+        """Return ``position`` with another depth, metres."""
         return np.array([position[0], position[1], self._draw_depth(rng)])
 
     def _draw_depth(self, rng: Generator) -> float:
@@ -188,8 +188,8 @@ class DistancePlacement(_Placement):
     """Uniform in the depth of the object's origin and, laterally, over the image.
 
     Attributes:
-        nearest: Smallest depth.
-        farthest: Largest depth.
+        nearest: Smallest depth, metres.
+        farthest: Largest depth, metres.
         margin: Smallest distance of the origin from the border, in image widths and heights.
     """
 
@@ -261,8 +261,8 @@ class WorkingPlacement(_Placement):
     centred.
 
     Attributes:
-        nearest: Smallest depth.
-        farthest: Largest depth.
+        nearest: Smallest depth, metres.
+        farthest: Largest depth, metres.
     """
 
     _ends = ("nearest", "farthest")
@@ -303,7 +303,7 @@ Placement = Annotated[
 def _depth_that_fills(
     share: float, ray: Vector, K: CameraMatrix, size: Size, centred_hull: Points
 ) -> float:
-    """Return the depth on a ray at which the hull's bounding box fills a share of the image."""
+    """Return the depth, metres, at which a hull on a ray fills a share of the image's side."""
     closest = float(-centred_hull[:, 2].min()) * (1 + 1e-6)
     rays, rows, columns = centred_hull @ K[:2].T, ray @ K[:2].T, np.array(size, np.float64)
     low, high = closest, np.inf

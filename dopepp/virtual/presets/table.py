@@ -26,12 +26,12 @@ class Pile(Checked):
 
     Attributes:
         piles: Number of different heaps in every 10,000 images; heaps are cached on disk.
-        mixed_share: Share of heaps of all kinds of targets; other heaps have one kind.
-        bin_share: Share of heaps in a bin; other heaps lie on the open table.
-        room: Side of the area into which objects fall, and of the bin, for one object, over the
-            cube root of its bounding box; the side grows with the root of the number of objects.
-        wall_height: Height of the bin's walls.
-        aside: Largest distance of the camera's aim from the heap's middle, heap radii.
+        mixed_share: Probability that a heap has all kinds of targets; other heaps have one kind.
+        bin_share: Probability that a heap lies in a bin and not on the open table.
+        room: Side of the square bin or drop area over the objects' mean size (cube root of the
+            bounding box's volume) and over the square root of their number.
+        wall_height: Height of the bin's walls, diameters of the largest target.
+        aside: Largest distance of the optical axis from the heap's middle, heap radii.
     """
 
     piles: Annotated[int, Range(1, 10_000, "a count")] = 200
@@ -42,7 +42,7 @@ class Pile(Checked):
     aside: Share = 0.4
 
     def number(self, index: int) -> int:
-        """Return the number of an image's heap; blocks of 10,000 images share no heap."""
+        """Return the heap's index for an image's index; blocks of 10,000 images share no heap."""
         return index // 10_000 * self.piles + index % self.piles
 
 
@@ -51,16 +51,17 @@ class Table(Checked):
     """A supporting plane in front of a robot's camera.
 
     Attributes:
-        distance: Distance from the camera to the plane along the line of sight.
-        elevation_deg: Angle between the plane and the line of sight; 90 looks straight down.
-        roll_deg: Largest rotation of the camera about its line of sight to either side.
-        tilted_share: Share of objects that lean by ``tilt_deg`` instead of resting on a face.
+        distance: Distance from the camera to the plane along the optical axis, metres.
+        elevation_deg: Angle between the plane and the optical axis; 90 looks straight down.
+        roll_deg: Largest rotation of the camera about its optical axis to either side.
+        tilted_share: Probability that an object leans by ``tilt_deg`` instead of resting on a face.
         tilt_deg: Angle by which leaning objects are tilted.
-        heaped: Whether objects are dropped onto a heap instead of lying side by side.
-        heap_radius: Radius within which a heap's objects are dropped.
+        heaped: Whether objects are lowered onto a heap instead of lying side by side.
+        heap_radius: Radius within which a heap's objects are lowered, diameters of the largest
+            target.
         pile: Heaps dropped by physics, in place of single objects; None for no physics.
-        picture_width: Width of the plane that the background's image covers; outside, the
-            image is mirrored.
+        picture_width: Width on the plane that one background image covers, camera distances;
+            outside, the image is mirrored.
     """
 
     distance: Annotated[Pair, Span(0.02, 100.0, "metres")] = (0.25, 0.60)
@@ -83,7 +84,7 @@ class Table(Checked):
         return make_transform(rotation, np.array([0.0, 0.0, distance]))
 
     def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:
-        """Sample an object's orientation: resting on a stable face, or leaning.
+        """Sample an object's orientation: resting on a stable face of ``hull``, or leaning.
 
         Returns:
             Rotation from the object to the table frame, and the height of the object's lowest point
@@ -109,7 +110,7 @@ class Table(Checked):
         size: Size,
         T_cam_table: Transform,
     ) -> TableImage:
-        """Sample the plane's image and, if the plane's end is in view, the surroundings."""
+        """Sample the plane's image and, if the plane's end is in view, the image beyond the end."""
         width, height = size
         image = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
@@ -125,7 +126,7 @@ class Table(Checked):
 
 @dataclass(frozen=True, eq=False)
 class TableImage:
-    """The image of the plane, and the surroundings beyond the plane's end.
+    """The image on the plane, and the surroundings beyond the plane's end.
 
     Attributes:
         image_table: Homography from (x, y) in the table frame, metres, to the image's pixels.
@@ -156,7 +157,7 @@ def plane_of(T_cam_table: Transform) -> Plane:
 
 
 def _beyond(end: float, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Mask | None:
-    """Return the mask of pixels beyond the plane's end, or None if the mask is empty."""
+    """Return the mask of pixels where the plane is deeper than ``end`` metres; None if empty."""
     width, height = size
     slope = plane_of(T_cam_table).inverse_depth_row(K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]

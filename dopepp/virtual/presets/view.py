@@ -1,4 +1,4 @@
-"""A working camera: the scale and the windows of training images for a lens, distances and parts.
+"""Scale and windows of training images for a camera, its working distances and parts.
 
 The network's input is scaled down until parts have sizes in pixels that networks learn well.
 Training uses windows, because a part covers a small share of a large image.
@@ -45,10 +45,10 @@ class View:
         size: (width, height) of the camera's images, pixels.
         K: Camera matrix, pixels.
         distance: Nearest and farthest distance of a part's middle, along the optical axis, metres.
-        source: Origin of the camera, for messages.
+        source: Name of the camera or its file, for messages.
 
     Raises:
-        UserError: K does not fit the image size, or the distances are not a range.
+        UserError: K does not fit the image size, or the distances are not an ascending pair.
     """
 
     size: Size
@@ -74,10 +74,10 @@ class View:
         return focal * min(diameters) / far, focal * max(diameters) / near
 
     def check(self, parts: Sequence[Part], scale: float = 1.0) -> None:
-        """Check the size of parts in the camera's and the scaled images.
+        """Check the size of parts in the camera's images and in images scaled by ``scale``.
 
         Raises:
-            UserError: A part is larger than the image, or too small for the network.
+            UserError: A part exceeds the camera's image, or is scaled to below :data:`MIN_PX`.
         """
         smallest, largest = self.sizes_px(parts)
         width, height = self.size
@@ -99,9 +99,9 @@ class View:
             )
 
     def scale_for(self, parts: Sequence[Part], window: Size | None = None) -> float:
-        """Choose the scale of the network's input, at most 1.
+        """Return the scale (at most 1) of the network's input relative to the camera's images.
 
-        The farthest part keeps at least 45 pixels if the camera resolves that many; the nearest
+        The farthest part spans at least 45 pixels if the camera resolves that many; the nearest
         part fits into ``window``.
         """
         smallest, largest = self.sizes_px(parts)
@@ -111,13 +111,13 @@ class View:
         return float(f"{min(scale, 1.0):.3g}")
 
     def window_for(self, parts: Sequence[Part], scale: float) -> Size:
-        """Choose the window's size: a square that contains the largest part."""
+        """Return a square window with room for the largest part, within the scaled image, pixels."""
         lengths = _ROOM * self.sizes_px(parts, scale)[1], *(scale * side for side in self.size)
         side, width, height = (_MULTIPLE * math.ceil(length / _MULTIPLE) for length in lengths)
         return min(side, width), min(side, height)
 
     def window(self, preset: Preset, scale: float, size: Size | None) -> Preset:
-        """Return a preset's scenes in windows of the network's input, with the preset's sensors."""
+        """Return a preset for windows (None: whole images) of this camera's scaled images."""
         near, far = self.distance
         table = preset.table and replace(preset.table, distance=(near, far))
         return replace(
@@ -132,14 +132,14 @@ class View:
         )
 
     def whole(self, preset: Preset, scale: float) -> Preset:
-        """Return a preset's scenes in whole images, with blur matched to the scaled windows."""
+        """Return a preset for whole, unscaled images, with blurs divided by ``scale``."""
         sensors = preset.sensors.resized(min(1 / scale, _MAX_BLUR))
         return replace(self.window(preset, 1.0, None), sensors=sensors)
 
     def in_words(
         self, parts: Sequence[Part], scale: float = 1.0, window: Size | None = None
     ) -> list[str]:
-        """Describe the size of parts in the network's input, with warnings."""
+        """Return lines of text: camera, sizes of parts in the network's input, and warnings."""
         near, far = (1000 * end / (scale * focal_length(self.K)) for end in self.distance)
         smallest, largest = self.sizes_px(parts, scale)
         across, down = (
@@ -192,6 +192,6 @@ def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
 
 
 def _named(parts: Sequence[Part], choose: Callable[..., Part]) -> str:
-    """Name the part with the smallest or largest diameter."""
+    """Return name and diameter of the part that ``choose`` (min or max) selects by diameter."""
     part = choose(parts, key=lambda part: part.diameter)
     return f"{part.name} ({1000 * part.diameter:.0f} mm across)"
