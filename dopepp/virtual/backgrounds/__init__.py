@@ -39,10 +39,10 @@ class Backgrounds(Protocol):
     """Source of random background images."""
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
-        """Return an RGB image, a pure function of the generator's state."""
+        """Return an RGB image that depends only on the arguments."""
 
     def identity(self) -> list[str]:
-        """Return the kind and a fingerprint of its files, for the record of the render."""
+        """Return the kind and a fingerprint of its files, for the records of renders."""
 
 
 def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Backgrounds:
@@ -51,7 +51,7 @@ def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Ba
     Args:
         choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
             installed scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
-        split: Photos to choose from (:meth:`PhotoBackgrounds.part`).
+        split: Split of the photos (:meth:`PhotoBackgrounds.part`).
 
     Raises:
         UserError: The folder is missing or contains no photo, or scikit-image is not installed.
@@ -79,12 +79,12 @@ class MixedBackgrounds:
 
 
 def shipped_photos(split: Literal["val", "test"]) -> PhotoBackgrounds:
-    """Return half of the photos in this package, which no training uses."""
+    """Return the validation or test half of this package's photos, which training never uses."""
     return PhotoBackgrounds(_SHIPPED).part(split, held_out=0.5)
 
 
 def bundled_photos() -> PhotoBackgrounds:
-    """Return the photos in scikit-image's package; nothing is downloaded or imported.
+    """Return the photos in an installed scikit-image; nothing is downloaded or imported.
 
     Raises:
         UserError: scikit-image or its photos are not installed.

@@ -1,4 +1,4 @@
-"""Photos of a folder as backgrounds and frames, divided between training, validation and test."""
+"""Photos of a folder as backgrounds and images, divided between training, validation and test."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _LONGEST_PHOTO_PX: Final = 1000
 so 1000 lets a photo of 4000 pixels decode at a quarter."""
 
 _MIN_REDUCTION: Final = 2.0
-"""Smallest factor by which a crop is reduced. A crop is taken from the coarsest halving of a photo
-that allows this factor, which is cheaper than reducing the whole photo."""
+"""Smallest factor by which a crop is reduced. A crop is taken from the coarsest of the photo's
+:func:`_halvings` that allows this factor."""
 
 PhotoSplit = Literal["train", "val", "test", "all"]
 
@@ -45,8 +45,8 @@ _KEPT_BYTES: Final = 200_000_000  # decoded photos cached per process: about 260
 class PhotoBackgrounds:
     """Random crops of photos, mirrored and dimmed at random.
 
-    A damaged photo is logged and replaced by the next draw, so an image stays a pure function of
-    the generator and the files.
+    A damaged photo is logged and replaced by another random photo, so an image depends only on the
+    generator and the files.
 
     Args:
         folder: Folder to search recursively for :data:`PHOTO_SUFFIXES`, without hidden files and
@@ -54,8 +54,8 @@ class PhotoBackgrounds:
         names: Relative paths of the photos, instead of a search.
 
     Raises:
-        UserError: The folder contains no photo; or, while drawing, more than 10 photos or more than
-            1 % of all photos are damaged.
+        UserError: The folder contains no photo; or, in :meth:`draw` and :meth:`frame`, more than 10
+            photos or more than 1 % of all photos are damaged.
     """
 
     def __init__(self, folder: Path, names: Sequence[str] | None = None) -> None:
@@ -86,9 +86,9 @@ class PhotoBackgrounds:
     def part(self, split: PhotoSplit, held_out: float = HELD_OUT) -> PhotoBackgrounds:
         """Return the photos of one split.
 
-        Photos are divided by the order of their hashes. Splits therefore do not depend on names or
-        folders, and copies of a photo are in the same split. With fewer than six different photos,
-        all splits are the whole folder (:meth:`is_divided` is False).
+        Photos are divided by the order of their content's hashes. Splits therefore do not depend on
+        names or folders, and copies of a photo are in the same split. With fewer than six different
+        photos, all splits are the whole folder (:meth:`is_divided` is False).
 
         Args:
             split: Split to return; ``all`` for the whole folder.
@@ -113,11 +113,11 @@ class PhotoBackgrounds:
 
     @property
     def is_divided(self) -> bool:
-        """Whether the photos belong to a single split."""
+        """Whether the photos are one split of the folder, not the whole folder."""
         return self.split != "all"
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
-        """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side."""
+        """Return a random crop of a photo: 40 % to 100 % of the largest crop of this shape."""
         sizes = None
         while sizes is None:
             sizes = self._photo(self.paths[int(rng.integers(len(self.paths)))])
@@ -140,13 +140,13 @@ class PhotoBackgrounds:
     def frame(
         self, rng: Generator, number: int, size: Size, share: float = 1.0, mirrored: bool = False
     ) -> tuple[RGBImage, Path]:
-        """Return a photo that covers a frame, and its path.
+        """Return a region of a photo, scaled to ``size``, and the photo's path.
 
         Args:
             rng: Generator of the region's position; unused for the largest region.
             number: Index of the photo; a damaged photo is replaced by the next.
-            size: (width, height) of the frame, pixels.
-            share: Ratio of the region's side to the largest side at the frame's aspect ratio.
+            size: (width, height) of the returned image, pixels.
+            share: Ratio of the region's side to the largest side at this aspect ratio.
             mirrored: Whether to flip left and right.
 
         Raises:
@@ -170,7 +170,7 @@ class PhotoBackgrounds:
         return np.asarray(cv2.resize(crop, size, interpolation=interpolation), np.uint8), path
 
     def _photo(self, path: Path) -> list[RGBImage] | None:
-        """Return a reduced photo and its halvings from the cache or file; None if damaged."""
+        """Return :func:`_halvings` of a photo from the cache or the file; None if damaged."""
         if path in self._photos:
             self._photos.move_to_end(path)
             return self._photos[path]
@@ -186,7 +186,7 @@ class PhotoBackgrounds:
         return sizes
 
     def _read(self, path: Path, longest: int | None = None) -> RGBImage | None:
-        """Read a photo, or log that it is damaged; raise if too many photos are damaged."""
+        """Return a photo, or log that it is damaged and return None; raise if too many are."""
         if path in self.bad:
             return None
         try:
@@ -207,7 +207,7 @@ class PhotoBackgrounds:
 
 
 def _halvings(photo: RGBImage) -> list[RGBImage]:
-    """Return a photo and its successive halvings."""
+    """Return a photo and the same photo at 1/2, 1/4, … of its size, to a side of 30 pixels."""
     sizes = [photo]
     while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_PX:
         half = cv2.resize(sizes[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -216,7 +216,7 @@ def _halvings(photo: RGBImage) -> list[RGBImage]:
 
 
 def _photo_names(folder: Path) -> Iterator[str]:
-    """Yield the relative paths of a folder's photos."""
+    """Yield the paths of all photos below a folder, relative to the folder, in any order."""
     if not folder.is_dir():
         return
     pending = [""]

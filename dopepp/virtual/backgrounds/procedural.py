@@ -1,8 +1,8 @@
-"""Drawn backgrounds: procedural textures with shapes, and clutter.
+"""Procedural backgrounds: textures with shapes, and clutter.
 
 Photos of landscapes and people have few sharp outlines of the size of a part. A network trained on
-these photos alone detects the part all over a real desk; clutter therefore adds pieces of other
-images. To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
+these photos alone falsely detects the part all over a real desk; clutter therefore adds pieces of
+other images. To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class ProceduralBackgrounds:
     """Textures made from noise, gradients, tiles, bricks, wood and scattered shapes."""
 
     def identity(self) -> list[str]:
-        """Return the kind alone: procedural backgrounds need no files."""
+        """Return the kind; procedural backgrounds have no files to identify."""
         return ["procedural"]
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
-        """Return one texture, or two blended by a third, with 0 to 12 shapes scattered over it."""
+        """Return one texture, or two blended by smooth noise, with 0 to 12 random shapes on top."""
         image = _texture(rng, width, height)
         if rng.random() < 0.4:
             columns, rows = max(width // 8, 1), max(height // 8, 1)
@@ -47,7 +47,7 @@ class ProceduralBackgrounds:
 
 
 def _texture(rng: Generator, width: int, height: int) -> RGBImage:
-    """Return a random pattern in a random palette of two to five colours."""
+    """Return a random pattern, coloured by a random :func:`_palette`."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
     scale = 1.0
     # Large backgrounds are drawn coarser and enlarged, because backgrounds are out of focus.
@@ -64,7 +64,7 @@ def _texture(rng: Generator, width: int, height: int) -> RGBImage:
 
 
 def _palette(rng: Generator) -> UInt8[np.ndarray, "256 1 3"]:
-    """Return a colour map through random colours; most are muted or close to one colour."""
+    """Return a colour map that interpolates two to five random colours, mostly muted."""
     count = int(rng.integers(2, 6))
     colours = rng.uniform(0, 255, (count, 3))
     if rng.random() < 0.5:
@@ -95,7 +95,7 @@ def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
 
 
 def _clouds(rng: Generator, width: int, height: int) -> Field:
-    """Return noise summed over several scales, each with a random share."""
+    """Return noise summed over up to five octaves, whose weights fall by a random factor."""
     field = np.zeros((height, width), np.float32)
     total, cells, gain = 0.0, int(rng.integers(2, 8)), rng.uniform(0.4, 0.9)
     for octave in range(5):
@@ -108,7 +108,7 @@ def _clouds(rng: Generator, width: int, height: int) -> Field:
 
 
 def _coordinates(rng: Generator, width: int, height: int) -> tuple[Field, Field]:
-    """Return rotated, bent image coordinates with perspective, in units of about the width."""
+    """Return pixel coordinates, rotated, bent and in perspective, in units of about the width."""
     angle, bend = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.08)
     x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[None]
     y = (np.linspace(-0.5, 0.5, height, dtype=np.float32) * (height / width))[:, None]
@@ -122,7 +122,7 @@ def _coordinates(rng: Generator, width: int, height: int) -> tuple[Field, Field]
 
 
 def _gradient(rng: Generator, width: int, height: int) -> Field:
-    """Return a smooth gradient that curves across one direction."""
+    """Return a gradient that is linear along one direction and quadratic across it."""
     along, across = _coordinates(rng, width, height)
     return np.asarray(along * np.float32(rng.uniform(0.5, 1.5)) + across * across + 0.5)
 
@@ -141,7 +141,7 @@ def _whole(values: Field) -> Int32[np.ndarray, "height width"]:
 
 
 def _bricks(rng: Generator, width: int, height: int) -> Field:
-    """Return a running bond with mortar joints and a different shade for every brick."""
+    """Return rows of bricks, offset by half a brick, with mortar joints and random shades."""
     along, across = _coordinates(rng, width, height)
     across = across * np.float32(rng.uniform(4, 14))
     row = _whole(across)
@@ -155,7 +155,7 @@ def _bricks(rng: Generator, width: int, height: int) -> Field:
 
 
 def _wood(rng: Generator, width: int, height: int) -> Field:
-    """Return year rings of a trunk cut lengthwise: bent stripes with fibres."""
+    """Return wood grain: bent stripes (the growth rings of a board) with fibres."""
     along, across = _coordinates(rng, width, height)
     rings = across * np.float32(rng.uniform(6, 30)) + 2 * _noise(rng, width, height, 3)
     rings += np.float32(rng.uniform(0, 4)) * along * along
@@ -222,11 +222,11 @@ class ClutteredBackgrounds:
         self.behind, self.number, self.contrast = behind, number, contrast
 
     def identity(self) -> list[str]:
-        """Return the identity of the backgrounds, the number of pieces and the contrast."""
+        """Return the identity of ``behind``, and the limits of the number and the contrast."""
         return [*self.behind.identity(), "cluttered", *map(str, (*self.number, *self.contrast))]
 
     def draw(self, rng: Generator, width: int, height: int) -> RGBImage:
-        """Return a background with pieces."""
+        """Return a background with pieces of other images, at a random contrast."""
         image = self.behind.draw(rng, width, height).copy()
         for _ in range(int(rng.integers(self.number[0], self.number[1] + 1))):
             self._add_piece(rng, image)
@@ -237,7 +237,7 @@ class ClutteredBackgrounds:
         return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
     def _add_piece(self, rng: Generator, image: RGBImage) -> None:
-        """Paint a piece on an image, clipped at the border."""
+        """Paint a random piece of another image onto ``image``, clipped at its border."""
         rows, columns = image.shape[:2]
         size = columns * math.exp(rng.uniform(*np.log(_WIDTHS)))
         outline = _outline(rng) * size / 2
@@ -260,7 +260,7 @@ class ClutteredBackgrounds:
 
 
 def _outline(rng: Generator) -> Float[np.ndarray, "loops points 2"]:
-    """Return one closed line or two nested closed lines within the unit circle."""
+    """Return one closed polygon, or a ring of two nested polygons, within the unit circle."""
     kind = int(rng.integers(4))
     corners = (int(rng.integers(3, 9)), 4, 32, 32)[kind]
     angles = np.arange(corners) / corners * 2 * np.pi

@@ -111,7 +111,7 @@ class View:
         return float(f"{min(scale, 1.0):.3g}")
 
     def window_for(self, parts: Sequence[Part], scale: float) -> Size:
-        """Return a square window with room for the largest part, within the scaled image, pixels."""
+        """Return a square window, pixels, with room for the largest part, or the scaled image."""
         lengths = _ROOM * self.sizes_px(parts, scale)[1], *(scale * side for side in self.size)
         side, width, height = (_MULTIPLE * math.ceil(length / _MULTIPLE) for length in lengths)
         return min(side, width), min(side, height)

@@ -1,4 +1,4 @@
-"""Surfaces: meshes prepared for rendering, with normals and creases, texture, open sky and hull."""
+"""Surfaces: meshes prepared for rendering, with normals, texture, ambient occlusion and hull."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Surface:
     Attributes:
         vertices: float64; ``faces`` are their indices, int32.
         normals: Unit normal of every face's corner, object frame, float32.
-        patches: Number of every face's smooth patch, int32: faces that connect without a crease.
+        patches: Index of every face's smooth patch, int32: faces that connect without a crease.
         uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
         colours: Linear albedo per vertex; shape (0, 3) without colours or with a texture.
         closed: Watertight with outward winding, so back faces can be dropped.
@@ -86,7 +86,7 @@ class Surface:
 
 
 def make_surface(mesh: Mesh) -> Surface:
-    """Prepare a mesh for rendering (a quarter of a second; do it once per part).
+    """Prepare a mesh for rendering; takes a quarter of a second, so call it once per part.
 
     Raises:
         UserError: The mesh has no faces, a value that is not finite, or a wrong vertex index.
@@ -134,7 +134,7 @@ def make_surface(mesh: Mesh) -> Surface:
 
 
 def _spread_points(corners: Corners, weights: PerFace) -> Points:
-    """Return points spread evenly over the mesh's area, or its corners if the area is 0."""
+    """Return points spread over triangles in proportion to ``weights``; corners if all are 0."""
     if weights.sum() <= 0.0:
         return corners.reshape(-1, 3)[:_NUM_POINTS]
     levels = (np.arange(_NUM_POINTS) + 0.5) / _NUM_POINTS * weights.sum()
@@ -147,7 +147,7 @@ def _spread_points(corners: Corners, weights: PerFace) -> Points:
 
 
 def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
-    """Number vertices so that equal positions share a number."""
+    """Return an index per vertex that vertices at equal positions share."""
     # STL and UV seams split vertices, so vertices in the same cell of a fine grid are merged. Three
     # coordinates of 21 bits fit into an integer of 64 bits.
     step = max(float(np.ptp(vertices, axis=0).max()), 1e-12) / (2**21 - 1)
@@ -157,7 +157,7 @@ def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
 
 
 def _is_closed(merged: Faces, triangles: Corners) -> bool:
-    """Return whether every edge has two faces of one orientation, and the volume is positive."""
+    """Return whether each edge has two faces of consistent winding, and the volume is positive."""
     collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
     topology = find_topology(merged[~collapsed])
     if collapsed.all() or not topology.is_closed or topology.opposed.any():
@@ -208,7 +208,7 @@ def _average_normals(
     """Average normals at every corner over the faces around its vertex that meet without a crease.
 
     Vertex v has the corners from ``offsets[v]`` to ``offsets[v + 1]`` of ``corners``, numbered
-    3·face + k. Normals of degenerate faces are zero. ``cosine`` belongs to the crease angle.
+    3·face + k. Normals of degenerate faces are zero. ``cosine`` is that of the crease angle.
     """
     for vertex in range(offsets.shape[0] - 1):
         for p in range(offsets[vertex], offsets[vertex + 1]):
@@ -236,7 +236,7 @@ def _average_normals(
 def _smooth_patches(
     corners: Faces, normals: Corners, usable: Bool[np.ndarray, "faces"]
 ) -> Int[np.ndarray, "faces"]:
-    """Number the smooth patches: faces connected by edges without a crease share a number.
+    """Return each face's smooth patch: faces connected by edges without a crease share an index.
 
     Normals of corners are equal across a smooth edge. Only ``usable`` faces connect other faces.
     """

@@ -1,9 +1,9 @@
 """Baked ambient occlusion: the open share of the sky above every point of a surface.
 
-The mesh is drawn as depth maps from directions all around it, and points on its triangles are
-looked up in each map (as in Landis, "Production-ready global illumination", 2002). Every triangle
-has a grid of points, because a CAD plate is two huge triangles whose corners do not reflect a rib
-in the middle; small triangles have only their corners.
+The mesh is rendered as depth maps from directions all around it, and the depth of points on its
+triangles is compared with each map (as in Landis, "Production-ready global illumination", 2002).
+Every triangle has a grid of points, because a CAD plate is two huge triangles whose corners do not
+reflect a rib in the middle; small triangles have only their corners.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class _Points(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OpenSky:
-    """Cosine-weighted share of each point's hemisphere that its own mesh leaves open.
+    """Cosine-weighted share of each point's hemisphere that the mesh itself does not hide.
 
     Attributes:
-        steps: Steps along the edges of every triangle's grid, shape (F,).
-        firsts: First point of every triangle's grid, shape (F,).
-        values: Shares on the front sides, then on the back sides, shape (2, points).
+        steps: Number of grid steps along the edges of every triangle.
+        firsts: Index of the first point of every triangle's grid.
+        values: Shares at all points, on the front sides, then on the back sides.
     """
 
     steps: Int[np.ndarray, "faces"]
@@ -55,9 +55,9 @@ _BAKED: Final[dict[bytes, OpenSky]] = {}
 def bake_open_sky(
     vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3 3"], closed: bool
 ) -> OpenSky:
-    """Return the open sky of a mesh from its corner normals; a closed mesh has no back sides.
+    """Return the open sky of a mesh; a closed mesh needs no back sides.
 
-    Results are cached, because a run prepares its parts again for every data set.
+    Results are cached by a hash of the arguments, because a run prepares its parts repeatedly.
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
@@ -72,7 +72,7 @@ def bake_open_sky(
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
-    """Render depth maps of a mesh from all directions, and look up its points."""
+    """Compute the open sky of a mesh from depth maps in 24 to 256 directions."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
@@ -103,9 +103,9 @@ def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
 
 
 def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
-    """Choose every triangle's steps so that the points are few and evenly spaced.
+    """Return each triangle's steps, the index of its first point, and the number of all points.
 
-    Also return the index of each triangle's first point, and the number of points.
+    The spacing is the smallest, from ``_FINEST`` on, at which the points are few enough.
     """
     longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
     spacing, most = _FINEST * size, 3 * len(corners) + 40_000
@@ -120,7 +120,7 @@ def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
 
 
 def spread_directions(count: int) -> Float[np.ndarray, "directions 3"]:
-    """Return directions spread evenly over the sphere (a Fibonacci spiral)."""
+    """Return unit vectors spread evenly over the sphere (a Fibonacci spiral)."""
     k = np.arange(count) + 0.5
     z, angle = 1 - 2 * k / count, k * np.pi * (1 + np.sqrt(5))
     ring = np.sqrt(1 - z * z)
@@ -130,7 +130,7 @@ def spread_directions(count: int) -> Float[np.ndarray, "directions 3"]:
 def _spread(
     corners: Array, normals: Array, steps: Array, firsts: Array, count: int
 ) -> tuple[Array, Array, Array]:
-    """Return the points of every triangle's grid, their normals and their triangle."""
+    """Return the points of all triangles' grids, their unit normals and their triangles."""
     points, upright = np.empty((2, count, 3), np.float32)
     ground = np.empty(count, np.int32)
     for n in np.unique(steps).tolist():

@@ -1,4 +1,4 @@
-"""Textures: a pyramid of halvings with anisotropic filtering over each pixel's footprint.
+"""Textures: an image pyramid with anisotropic filtering over each pixel's footprint.
 
 A pixel's footprint on the texture is a parallelogram. Several probes cover its longer axis, each as
 wide as the shorter axis and interpolated between the two nearest levels, so a grazing surface
@@ -30,7 +30,7 @@ _SHARPNESS: Final = 0.75  # a probe's width over the footprint's; interpolation 
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A texture and its halvings down to one texel, the finest first.
+    """The image pyramid of a texture: levels of half the size each, down to one texel.
 
     Attributes:
         texels: RGB of all levels, row by row, uint8, shape (n, 3).
@@ -47,7 +47,7 @@ class Texture:
 
 
 def make_texture(image: RGBImage, uv: Float[np.ndarray, "vertices 2"], faces: Faces) -> Texture:
-    """Build the image pyramid of a mesh's texture."""
+    """Return the image pyramid of a texture, from the texels that the faces use."""
     shapes = [image.shape[:2]]
     while max(shapes[-1]) > 1:
         shapes.append((max(shapes[-1][0] // 2, 1), max(shapes[-1][1] // 2, 1)))
@@ -122,9 +122,9 @@ def _halve(
 def _bilinear(
     texels: Array, first: int, rows: int, columns: int, decode: Array, u: float, v: float
 ) -> tuple[float, float, float]:
-    """Sample a repeating level in linear light; v points up, and row 0 is the top.
+    """Return the linear RGB of a repeating level at (u, v); v points up, and row 0 is the top.
 
-    ``first`` is the level's first texel in ``texels`` (n, 3), and ``decode`` the table from sRGB.
+    ``first`` is the level's first texel in ``texels`` (n, 3); ``decode`` maps sRGB codes to light.
     """
     x = (u - math.floor(u)) * columns - 0.5
     y = (1.0 - (v - math.floor(v))) * rows - 0.5
@@ -149,7 +149,7 @@ def _bilinear(
 def sample_texture(
     points: tuple[Array, ...], hom: Array, faces: Array, uv: Array, texture: Lookup, out: Array
 ) -> None:
-    """Look up the texture at an object's fragments, filtered over a pixel.
+    """Sample the texture at an object's fragments, filtered over each pixel's footprint.
 
     Args:
         points: Fields ``face``, ``share``, ``x`` and ``y`` of the fragments.
