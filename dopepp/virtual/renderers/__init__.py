@@ -25,10 +25,10 @@ RENDERERS: Final = {
 
 
 def find_renderer(name: str) -> Renderer:
-    """Return a renderer by name.
+    """Import and return a renderer by its name in :data:`RENDERERS` or in an extension.
 
     Raises:
-        UserError: The renderer is unknown, or its extra is not installed.
+        UserError: The renderer is unknown, or a package that it needs is not installed.
     """
     modules = (
         RENDERERS if name in RENDERERS else {**extensions.components("renderers"), **RENDERERS}

@@ -61,8 +61,8 @@ def mitsuba() -> Any:
     """Return the ``mitsuba`` module with its variant and threads set.
 
     Raises:
-        UserError: Mitsuba is not installed, a setting is wrong, or this process was forked after
-            rendering and lacks the render threads.
+        UserError: Mitsuba is not installed, an environment variable is invalid, or this process was
+            forked after rendering and lacks the render threads.
     """
     require("mitsuba", "renderer 'photoreal'", "photoreal")
     pid = _start()
@@ -76,10 +76,10 @@ def mitsuba() -> Any:
 
 
 def num_threads() -> int:
-    """Return the number of render threads.
+    """Return the number of render threads of this process.
 
     Raises:
-        UserError: The environment variable is not a positive integer.
+        UserError: ``DOPEPP_RENDER_THREADS`` is not a positive integer.
     """
     setting = os.environ.get(THREADS_SETTING)
     if setting is not None:
@@ -92,7 +92,7 @@ def num_threads() -> int:
 
 @cache
 def _start() -> int:
-    """Import Mitsuba in the chosen variant and return this process's id."""
+    """Import Mitsuba in the chosen variant once, and return the id of the process that did."""
     library = _chosen_library()
     if library is not None and os.environ.get(LIBRARY_SETTING) != str(library):
         if "drjit" in sys.modules:
@@ -128,7 +128,7 @@ def _chosen_library() -> Path | None:
 
 
 def candidates() -> list[Path]:
-    """Return the libLLVM files to try, the newest version first."""
+    """Return the paths of installed libLLVM files, the newest version first."""
     setting = os.environ.get(LIBRARY_SETTING)
     if setting:
         return [Path(setting)]
@@ -143,7 +143,7 @@ def candidates() -> list[Path]:
 
 
 def is_usable(library: Path) -> bool:
-    """Return whether Mitsuba renders with a libLLVM, from the cache or by trying."""
+    """Return whether Mitsuba renders with a libLLVM, from the cache or by a trial in a process."""
     try:
         stat = library.stat()
     except OSError:

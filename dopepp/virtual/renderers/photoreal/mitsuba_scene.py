@@ -42,7 +42,7 @@ def make_shapes(mi: Any, scene: Scene) -> list[Any]:
 
 
 def make_surroundings(mi: Any, scene: Scene) -> dict[str, Any]:
-    """Return the lamps and the sky, to be merged into Mitsuba's description of the scene."""
+    """Return the lamps and the sky as entries of Mitsuba's description of a scene."""
     entries: dict[str, Any] = {"sky": _sky(mi, scene.ambient)}
     bounds = bounding_sphere(scene)
     for number, light in enumerate(scene.lights):
@@ -58,7 +58,7 @@ def make_surroundings(mi: Any, scene: Scene) -> dict[str, Any]:
 
 
 def bounding_sphere(scene: Scene) -> Sphere:
-    """Return a sphere around all objects of a scene that has some."""
+    """Return a sphere around all objects of a scene with at least one object."""
     hulls = [transform(item.T_cam_obj, item.surface.hull) for item in scene.objects]
     points = np.concatenate(hulls)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -80,12 +80,12 @@ def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
 
 
 def rgb(values: Vector) -> dict[str, Any]:
-    """Return a colour for Mitsuba."""
+    """Return Mitsuba's description of a linear RGB colour."""
     return {"type": "rgb", "value": [float(value) for value in values]}
 
 
 def _mesh(mi: Any, item: SceneObject, reflectance: Any) -> Any:
-    """Return a mesh whose triangles share no vertex, because normals break at creases."""
+    """Return a Mitsuba mesh whose triangles share no vertex, because normals differ at creases."""
     surface, rotation = item.surface, item.T_cam_obj[:3, :3]
     corners = transform(item.T_cam_obj, surface.vertices)[surface.faces].reshape(-1, 3)
     properties = mi.Properties()
@@ -108,7 +108,7 @@ def _mesh(mi: Any, item: SceneObject, reflectance: Any) -> Any:
 
 
 def _corner_uv(surface: Surface) -> Float[np.ndarray, "corners 2"]:
-    """Return texture coordinates, v down; without a texture, metres along the two flattest axes."""
+    """Return (u, v down) or, without a texture, metres along the axes most parallel to the face."""
     if len(surface.uv):
         uv = surface.uv[surface.faces].reshape(-1, 2)
         return np.asarray(np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1))
@@ -119,7 +119,7 @@ def _corner_uv(surface: Surface) -> Float[np.ndarray, "corners 2"]:
 
 
 def _reflectance(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
-    """Return the material: Lambert and GGX with a metallic workflow, on both sides."""
+    """Return Mitsuba's material: Lambert and GGX with a metallic workflow, on both sides."""
     material = item.material
     # Grooves widen the GGX roughness, whose square is α. A sine of largest slope s has the slope
     # variance s²/2 across the grooves, so s²/4 on average; α² is twice the variance.
@@ -139,7 +139,7 @@ def _reflectance(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
 
 
 def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
-    """Return the albedo: constant, mottled, of the vertices, or a texture, linear RGB."""
+    """Return the linear albedo for Mitsuba: a constant, noise, vertex colours or a texture."""
     material, texture = item.material, item.surface.texture
     colour = np.asarray(material.colour, np.float32)
     if texture is not None:
@@ -160,7 +160,7 @@ def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
 def _bitmap(
     mi: Any, texels: Float32[np.ndarray, "rows columns 3"], to_uv: np.ndarray
 ) -> dict[str, Any]:
-    """Return Mitsuba's description of a texture of linear colours."""
+    """Return Mitsuba's description of a texture of linear RGB; ``to_uv`` is a 4×4 transform."""
     bitmap = mi.Bitmap(np.clip(texels, 0.0, _MAX_ALBEDO))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "to_uv": mi.ScalarTransform4f(to_uv)}
 
@@ -182,7 +182,7 @@ def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
 
 
 def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
-    """Return the environment, with a colour above and a colour below the horizon."""
+    """Return Mitsuba's environment map, with one colour above and one below the horizon."""
     pixels = np.empty((_SKY_ROWS, 2 * _SKY_ROWS, 3), np.float32)
     pixels[: _SKY_ROWS // 2], pixels[_SKY_ROWS // 2 :] = ambient.above, ambient.below
     up = np.array(ambient.up) / np.linalg.norm(ambient.up)
@@ -200,6 +200,7 @@ class Film:
 
     Attributes:
         size: (width, height) of the film, pixels.
+        focal_px: Focal length, pixels of the film.
         centre_px: Principal point; pixel (0, 0) is the centre of the film's first pixel.
         film_from_window: Affine map, 2×3, from the window's pixels to the film's.
     """
@@ -211,7 +212,7 @@ class Film:
     film_from_window: Float[np.ndarray, "2 3"]
 
     def sensor(self, mi: Any, samples: int) -> dict[str, Any]:
-        """Return the camera, at the origin of the camera frame, for Mitsuba."""
+        """Return Mitsuba's description of the camera, with ``samples`` rays per pixel."""
         width, height = self.size
         return {
             "type": "perspective",
@@ -250,7 +251,7 @@ class Film:
 
 
 def make_film(K: CameraMatrix, window: Box) -> Film:
-    """Return the film over a window of the image."""
+    """Return the film that covers a window of the image."""
     left, top, right, bottom = window
     focal = float(max(K[0, 0], K[1, 1]))
     K_window = crop_camera(K, left, top)
@@ -268,7 +269,7 @@ def make_film(K: CameraMatrix, window: Box) -> Film:
 
 
 def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 3"]:
-    """Return the points at depth 1 m on the rays of the window's pixel centres."""
+    """Return the points (camera frame) at depth 1 m on the rays of a window's pixel centres."""
     left, top, right, bottom = window
     y, x = np.mgrid[top:bottom, left:right]
     return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(K).T)
@@ -277,7 +278,7 @@ def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 
 def cast(
     mi: Any, world: Any, shapes: list[Any], rays: Float[np.ndarray, "height width 3"]
 ) -> tuple[Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
-    """Return the depth (0 if nothing is hit) and the index of the shape of each ray (−1 if none).
+    """Return depth (metres; 0 without a hit) and index of the shape (−1 without) for each ray.
 
     ``rays`` are points at depth 1 m; hits nearer than ``NEAR`` are ignored.
     """

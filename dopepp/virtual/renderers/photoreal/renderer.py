@@ -68,7 +68,7 @@ _RADIANCE_OF_CODE: Final = np.interp(
 
 _ALBEDO: Final = (0.05, 0.8)  # bounds of the disc's albedo, estimated from its image and light
 _MIN_LIGHT: Final = 1e-3  # radiance of a white table below which shadows are not estimated
-_SPREAD_PX: Final = 2.0  # width over which a shadow is extrapolated under an object's rim
+_SPREAD_PX: Final = 2.0  # Gaussian width by which a shadow is extrapolated under an object's rim
 _FLOAT3: Final = 3  # OIDN_FORMAT_FLOAT3
 
 
@@ -99,7 +99,7 @@ def render(scene: Scene) -> Rendered:
 
 
 def _objects_window(scene: Scene) -> Box | None:
-    """Return the part of the image that objects may touch, or None."""
+    """Return the box of pixels, with a margin, that objects may touch; None if out of view."""
     box = box_around(project_object(item, scene.K).box(scene.size) for item in scene.objects)
     if box is None:
         return None
@@ -126,7 +126,7 @@ class Tracer:
         self._seed = zlib.crc32(poses + noise_seed)
 
     def cast(self, window: Box) -> tuple[Depth, np.ndarray]:
-        """Return depth and object index at a window's pixel centres."""
+        """Return depth, metres, and object index at a window's pixel centres; see :func:`cast`."""
         world = self._mi.load_dict(self.world, parallel=False)
         return cast(self._mi, world, self._shapes, pixel_rays(self._scene.K, window))
 
@@ -150,7 +150,7 @@ class Tracer:
         return traced
 
     def paint_on_table(self, window: Box | None, plane: Depth, image: RGBImage) -> None:
-        """Paint objects and their shadows; ``plane`` is the plane's depth."""
+        """Paint objects and shadows onto ``image``; ``plane`` is the plane's depth, metres."""
         table = TableTop(self._scene, plane)
         window = table.window(window)
         if window is None:
@@ -170,7 +170,7 @@ class Tracer:
     def _measure(
         self, world: dict[str, Any], film: Film, integrator: dict[str, Any], samples: int
     ) -> Float32[np.ndarray, "film_height film_width channels"]:
-        """Return an integrator's output for every pixel of a film."""
+        """Return the channels that a Mitsuba integrator computes for every pixel of a film."""
         whole = {**world, "sensor": film.sensor(self._mi, samples), "integrator": integrator}
         # Parallel loading would order objects randomly and recompile for every order.
         loaded = self._mi.load_dict(whole, parallel=False)
@@ -178,7 +178,7 @@ class Tracer:
 
 
 def _composite(light: Colours, alpha: Depth, behind: RGBImage) -> RGBImage:
-    """Composite light over an image in linear light; ``alpha`` is the coverage."""
+    """Composite linear radiance over an image; ``alpha`` is the share that objects cover."""
     alpha = np.clip(alpha, 0.0, 1.0)[..., None]
     total = light + (1 - alpha) * _RADIANCE_OF_CODE[behind]
     steps = np.minimum(total * CODE_STEPS + 0.5, len(TONE_CURVE) - 1).astype(np.int32)
@@ -186,7 +186,6 @@ def _composite(light: Colours, alpha: Depth, behind: RGBImage) -> RGBImage:
 
 
 def _slices(window: Box) -> Area:
-    """Return the slices of rows and columns of a window."""
     left, top, right, bottom = window
     return slice(top, bottom), slice(left, right)
 
@@ -210,7 +209,7 @@ class TableTop:
         self.albedo = self._estimated_albedo()
 
     def window(self, objects: Box | None) -> Box | None:
-        """Return the part of the image with the disc and the objects, or None."""
+        """Return the box of pixels that show the disc or lie in ``objects``; None if empty."""
         shown = self._away < 1
         if objects is not None:
             shown[_slices(objects)] = True
@@ -220,7 +219,7 @@ class TableTop:
         return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
     def shape(self, mi: Any) -> dict[str, Any]:
-        """Return the disc for Mitsuba."""
+        """Return Mitsuba's description of the disc."""
         up = np.eye(3)[np.abs(self._normal).argmin()]
         target = list(self.centre + self._normal)
         to_world = mi.ScalarTransform4f().look_at(list(self.centre), target, list(up))
@@ -228,17 +227,17 @@ class TableTop:
         return {"type": "disk", "to_world": to_world.scale(self.radius), "bsdf": bsdf}
 
     def unshadowed(self, area: Area) -> Colours:
-        """Return the disc's radiance without objects; 0 outside the disc."""
+        """Return the disc's linear radiance without objects; 0 outside the disc."""
         return np.asarray(self.albedo * self._light[area])
 
     def fade(self, light_share: Colours, area: Area) -> Colours:
-        """Return the shares of light, faded to 1 towards the disc's rim."""
+        """Return the shares of light, faded to 1 from 60 % of the disc's radius to its rim."""
         share = np.clip((1 - self._away[area]) / (1 - 0.6), 0.0, 1.0)[..., None]
         # Smoothstep: no visible line at either end of the fading.
         return 1 + (light_share - 1) * share * share * (3 - 2 * share)
 
     def _full_light(self) -> Colours:
-        """Return the radiance of a white table without objects, in closed form."""
+        """Return the linear radiance of a white plane without objects, in closed form."""
         ambient = self._scene.ambient
         above = 0.5 + 0.5 * float(self._normal @ np.array(ambient.up))
         sky = above * np.array(ambient.above) + (1 - above) * np.array(ambient.below)
@@ -252,7 +251,7 @@ class TableTop:
         return light
 
     def _estimated_albedo(self) -> Vector:
-        """Return the albedo at which the disc is as bright as its image, within limits."""
+        """Return the linear albedo at which the disc is as bright as the background, clipped."""
         disc = self._away < 1
         if not disc.any():
             return np.full(3, np.mean(_ALBEDO))
@@ -262,10 +261,10 @@ class TableTop:
 
 
 def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colours, Colours]:
-    """Split radiance into the objects' radiance and the share of light that remains on the disc.
+    """Split radiance into the objects' radiance and the share of light that reaches the disc.
 
-    ``alpha`` is the coverage by objects; ``unshadowed`` is the radiance of the disc without
-    objects, 0 outside the disc.
+    ``alpha`` is the share of a pixel that objects cover; ``unshadowed`` is the radiance of the disc
+    without objects, 0 outside the disc.
     """
     is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _MIN_LIGHT)
     light_share = np.where(is_disc[..., None], light / np.maximum(unshadowed, _MIN_LIGHT), 1.0)
@@ -280,7 +279,7 @@ def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colo
 
 
 def darken(image: RGBImage, light_share: Colours) -> RGBImage:
-    """Multiply an image's linear light by the shares ``light_share`` in shadows."""
+    """Return an image with its linear light multiplied by ``light_share``."""
     steps = np.minimum(SRGB_TO_LINEAR[image] * light_share * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
     return np.where(light_share == 1.0, image, changed)

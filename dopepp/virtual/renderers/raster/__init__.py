@@ -1,4 +1,4 @@
-"""The rasteriser: a scene becomes an image, its depth, its instances and visible fractions."""
+"""The rasteriser: renders a scene's image, depth, instances and visible fractions."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ class Silhouette:
 
     Attributes:
         mask: Whether each image pixel shows the object.
-        num_px: Number of pixels on an unbounded canvas; infinite around the camera.
-        box: Bounds of the pixels, possibly beyond the image; None behind the camera.
+        num_px: Number of pixels on an unbounded canvas; infinite if the object reaches the camera.
+        box: Bounds of the pixels, possibly beyond the image; None if it is behind the camera.
     """
 
     mask: Mask
@@ -74,7 +74,7 @@ class Silhouette:
 
 
 def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
-    """Return an object's whole silhouette, for formats that store it (BOP's ``mask``)."""
+    """Return the silhouette of an object without occluders, which e.g. BOP stores as ``mask``."""
     projection = project_object(item, K)
     mask = draw_alone(item, projection.hom, (0, 0, *size))[0] > 0
     left, _, right, _ = projection.extent
@@ -87,7 +87,7 @@ def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
 
 
 def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
-    """Return each object's visible fraction as a render reports it, without computing colours."""
+    """Return the visible fractions of :func:`render` without computing colours."""
     projections = [project_object(item, scene.K) for item in scene.objects]
     samples = draw_samples(scene, projections, (0, 0, *scene.size), CENTRE_SAMPLE)
     owners = np.searchsorted(first_ids(scene), samples.ids[..., 0], side="right") - 1
@@ -97,7 +97,7 @@ def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
 def _fractions(
     scene: Scene, projections: Sequence[Projection], instances: Int16[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "objects"]:
-    """Divide every object's visible pixels by the pixels of its whole silhouette."""
+    """Return each object's visible pixels over the pixels of its silhouette without occluders."""
     visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projections) + 1)[1:]
     fractions = np.zeros(len(projections))
     for index in np.flatnonzero(visible).tolist():
@@ -137,7 +137,7 @@ def _occluder_box(scene: Scene, projections: Sequence[Projection], index: int) -
 
 
 def _depths(item: SceneObject) -> tuple[float, float]:
-    """Return conservative bounds of an object's depth, metres."""
+    """Return the smallest and largest depth of an object, metres, with a margin of 2 %."""
     depth = item.surface.hull @ item.T_cam_obj[2, :3] + item.T_cam_obj[2, 3]
     least, most = float(depth.min()), float(depth.max())
     # The hull's extreme points miss a little of a round object.
@@ -149,7 +149,7 @@ def _count_whole_px(item: SceneObject, projection: Projection, K: Array) -> floa
     """Count the pixel centres of an unoccluded object on an unbounded canvas."""
     left, top, right, bottom = projection.extent
     if not math.isfinite(left):
-        return math.inf  # the object surrounds the camera
+        return math.inf  # the object reaches the camera
     hom, scale, extent = projection.hom, 1.0, projection.extent
     if (right - left + 2) * (bottom - top + 2) > _MAX_PX:
         scale = math.sqrt(_MAX_PX / ((right - left + 2) * (bottom - top + 2)))
@@ -162,7 +162,7 @@ def _count_whole_px(item: SceneObject, projection: Projection, K: Array) -> floa
 def _composite(
     samples: Samples, colour: Array, first_ids: Array, image: Array, depth: Array, instances: Array
 ) -> None:
-    """Composite the sums of samples' sRGB values over the image, and write depth and instances."""
+    """Composite ``colour``, each pixel's sum of sRGB values, and write depth and instances."""
     origin, inverse_depth, ids = samples
     height, width, num_samples = ids.shape
     centre = num_samples - 1

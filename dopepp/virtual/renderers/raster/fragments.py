@@ -1,7 +1,7 @@
-"""Fragments: the part of a smooth patch that a pixel shows, the unit of shading.
+"""Fragments: a fragment is the part of one smooth patch in one pixel, and is shaded once.
 
-A pixel's samples on the same patch are shaded once, at their mean (centroid sampling). The cost
-therefore follows the number of pixels, not of samples or triangles.
+A pixel's samples on the same patch are shaded at their mean (centroid sampling). The cost therefore
+depends on the number of pixels, not of samples or triangles.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ _GROUP_TYPES: Final = {
 def gather_fragments(
     item: SceneObject, projection: Projection, scene: Scene, samples: Samples, first_id: int
 ) -> Fragments | None:
-    """Collect an object's fragments; None if it has none. The next call overwrites the arrays.
+    """Return an object's fragments; None if it has none. The next call overwrites the arrays.
 
-    ``first_id`` is the number of the object's first triangle; the albedo and alpha are not set.
+    ``first_id`` is the id of the object's first triangle; the albedo and alpha are not set.
     """
     box = projection.box(scene.size)
     if box is None:
@@ -210,7 +210,7 @@ def _interpolate(
 def _corner_heights(
     vertices: Array, a: int, b: int, c: int, normals: Array
 ) -> tuple[float, float, float, float, float, float]:
-    """Return the distances of each corner's two neighbours below its tangent plane, metres."""
+    """Return the distances of a triangle's corners below each other's tangent plane, metres."""
     # The depth of a point below each tangent plane is linear in these distances. The mean of the
     # three depths, weighted by the barycentric coordinates, is the depth below the smooth surface
     # (Hanika, "Hacking the shadow terminator", Ray Tracing Gems II, 2021).

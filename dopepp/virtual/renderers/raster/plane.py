@@ -43,9 +43,9 @@ class _LitPlane(NamedTuple):
     """A plane and its lights for compiled code, float32.
 
     Attributes:
-        to_point: Map from a pixel to its point and 1/z, shape (4, 3).
-        normal: Unit normal.
-        sky: Linear RGB of the ambient light.
+        to_point: Map from a pixel to its point on the plane and 1/z, shape (4, 3).
+        normal: Unit normal, camera frame.
+        sky: Linear RGB of the ambient light on the plane.
         lights: ``light`` of every shadow map.
         P: ``P`` of every shadow map.
     """
@@ -60,7 +60,7 @@ class _LitPlane(NamedTuple):
 def darken_plane(
     scene: Scene, plane: Plane, lights: Sequence[ShadowMap], samples: Samples, image: Array
 ) -> None:
-    """Darken the plane's image in place, except for pixels that objects fill."""
+    """Darken the image in place where objects shadow the plane and do not fill the pixel."""
     # Camera frame to (x, y) on the plane and the height above it, metres.
     rotation = rotation_to_z(np.array(plane.normal, np.float64))
     frame = np.column_stack([rotation, [0.0, 0.0, -plane.offset]])
@@ -97,7 +97,7 @@ def darken_plane(
 def _soft_shadow(
     plane: Plane, shadow: ShadowMap
 ) -> tuple[Float32[np.ndarray, "rows columns"], int]:
-    """Return the shadow of every texel with its penumbra, and the margin added for it, texels."""
+    """Return a shadow map's blocked share of light, with penumbra, and the added margin, texels."""
     P = shadow.P.astype(np.float64)
     # The plane's 1/depth is linear in the map as well: n · x = offset with x = M⁻¹ (depth (u, v, 1)
     # − p), P = [M | p].
@@ -126,7 +126,7 @@ def _soft_shadow(
 
 
 def _warp(source: Array, to_source: Array, box: Box, out: Array) -> None:
-    """Warp an image by a homography into the pixels of a box; 0 outside the image."""
+    """Fill ``out``, the pixels of a box, from ``source`` by a homography; 0 outside the source."""
     shift = np.array([[1.0, 0.0, box[0]], [0.0, 1.0, box[1]], [0.0, 0.0, 1.0]])
     size = (box[2] - box[0], box[3] - box[1])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -140,7 +140,7 @@ def _shadowed_box(
     cells: tuple[int, ...],
     lights: Sequence[ShadowMap],
 ) -> Box | None:
-    """Return the box of the plane's pixels that may be darker, or None."""
+    """Return the box of pixels that shadows may darken, or None."""
     size = scene.size
     right, bottom = grid[0] + cells[1] * grid[2], grid[1] + cells[0] * grid[2]
     corners = np.array([(x, y, 0.0) for x in (grid[0], right) for y in (grid[1], bottom)])
@@ -171,7 +171,7 @@ def _shadowed_box(
 def hidden_sky(
     frame: Float[np.ndarray, "3 4"], objects: Sequence[SceneObject]
 ) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
-    """Return the share of a plane's sky that objects hide; None if all are below the plane.
+    """Return the share of the sky over a plane that objects hide; None if all are below the plane.
 
     Args:
         frame: Map from the camera frame to (x, y) on the plane and the height above it, metres.
@@ -224,8 +224,8 @@ def hidden_sky(
 def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
     """Set a bit per direction of light in the cells that points (x, y, height) shade.
 
-    ``reach`` is the half-width of a point's shadow in cells, and ``slopes`` the displacement of the
-    shadow per height, by direction.
+    ``reach`` is the half-width of a point's shadow in cells, and ``slopes`` the displacement (x, y)
+    of the shadow per height for each direction.
     """
     rows, columns = bits.shape
     for p in range(points.shape[0]):
@@ -291,7 +291,7 @@ def _is_full(ids: Array, j: int, i: int) -> bool:
 def _light_row(
     corner: tuple[int, int], j: int, lit: _LitPlane, shades: Array, total: Array, lost: Array
 ) -> None:
-    """Fill ``total`` with the light on row j of ``shades``, and ``lost`` with the blocked light."""
+    """Fill ``total`` with the unblocked light on row j of ``shades``, ``lost`` with the blocked."""
     to_point, normal, sky, lights, P = lit
     fv = np.float32(corner[1] + j)
     px, py = to_point[0, 1] * fv + to_point[0, 2], to_point[1, 1] * fv + to_point[1, 2]

@@ -50,7 +50,7 @@ def shade_object(
 ) -> None:
     """Add an object's samples to ``colour``, the sum of sRGB values per pixel (height, width, 3).
 
-    ``first_id`` is the number of the object's first triangle in the samples.
+    ``first_id`` is the id of the object's first triangle in the samples.
     """
     fragments = gather_fragments(item, projection, scene, samples, first_id)
     if fragments is None:
@@ -79,7 +79,7 @@ def shade_object(
 def _set_albedo(
     item: SceneObject, projection: Projection, scene: Scene, fragments: Fragments
 ) -> None:
-    """Set the albedo to the surface's colour times the material's, with its noise."""
+    """Set the fragments' albedo to the surface's colour times the material's colour and noise."""
     surface, material, albedo = item.surface, item.material, fragments.albedo
     face, share = fragments.face, fragments.share
     if surface.texture is not None:
@@ -119,7 +119,7 @@ def _tint_albedo(
     amplitude: float,
     pitch: float,
 ) -> None:
-    """Vary the albedo over the surface; ``pitch`` is the step of the noise lattice, metres."""
+    """Multiply the albedo by 1 + ``amplitude`` times noise with a lattice of ``pitch`` metres."""
     position, albedo = fragments.position, fragments.albedo
     least, greatest = NOISE_LIMITS
     for p in range(position.shape[1]):
@@ -145,10 +145,10 @@ def _tint_albedo(
 def _tilt_normals(
     noise: Array, fragments: Fragments, axis: Array, origin: float, focal: Array, profile: Array
 ) -> None:
-    """Tilt the normals of grooved points, or widen their alpha where grooves are fine.
+    """Tilt the normals of a grooved surface, or widen alpha where grooves are finer than pixels.
 
     ``axis`` is the unit vector across the grooves, camera frame; ``origin`` is the coordinate of
-    the object's origin along it, metres; ``profile`` is pitch, slope and irregularity.
+    the object's origin along it, metres; ``profile`` is pitch (metres), slope and irregularity.
     """
     position, normal, alpha = fragments.position, fragments.normal, fragments.alpha
     ax, ay, az = axis
@@ -205,7 +205,7 @@ def _value_noise(noise: Array, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
 
 @compiled(fastmath=True)
 def _streak_noise(noise: Array, x: Scalar) -> Scalar:
-    """Return noise in [-1, 1] along a line; it repeats after 32³ steps."""
+    """Return linear noise in [-1, 1] of pitch 1 along a line; it repeats after 32³ steps."""
     fx = math.floor(x)
     share, i = x - fx, int(fx)
     j = i + 1
@@ -218,7 +218,7 @@ def _streak_noise(noise: Array, x: Scalar) -> Scalar:
 def reflect_ambient(
     fragments: Fragments, opened: Array, ambient: Array, metallic: float, radiance: Array
 ) -> None:
-    """Set the radiance to the reflected ambient light.
+    """Set ``radiance`` to the ambient light that the fragments reflect to the camera.
 
     A dielectric scatters the hemisphere around its normal; its weak gloss is ignored. A metal
     mirrors the hemisphere's colour in the reflected direction, tinted with its albedo; a smoother
@@ -263,15 +263,15 @@ def reflect_light(
     metallic: float,
     radiance: Array,
 ) -> None:
-    """Add a point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
+    """Add the reflection of a point light: Lambert, and GGX with Smith's and Schlick's factors.
 
     Args:
         fragments: Fragments of the object.
         lit: Share of the light that reaches each point.
-        light: As in :class:`ShadowMap`.
+        light: Field ``light`` of the light's :class:`ShadowMap`.
         specular: Reflectance of a dielectric at normal incidence.
         metallic: 1 for a metal, whose reflectance is its albedo.
-        radiance: Updated in place.
+        radiance: Linear RGB, increased in place.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
@@ -309,7 +309,7 @@ def reflect_light(
 
 @compiled(fastmath=True)
 def _add_colour(pixel: Array, weight: Array, radiance: Array, curve: Array, colour: Array) -> None:
-    """Add fragments to the sums of their pixels' sRGB values; ``curve`` is the tone curve.
+    """Add the fragments' sRGB values, by ``weight``, to their pixels; ``curve`` is the tone curve.
 
     Light is encoded before samples are averaged, so a highlight's edge stays smooth.
     """

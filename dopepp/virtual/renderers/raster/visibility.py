@@ -44,9 +44,10 @@ class Projection:
     """The projected vertices of an object.
 
     Attributes:
-        cam: Camera frame, metres, shape (V, 3).
+        cam: Vertices in the camera frame, metres, shape (V, 3).
         hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
-        extent: Bounds of the object's image; infinite across the camera plane, left > right behind.
+        extent: Bounds of the projected vertices, pixels; infinite if the object crosses the depth
+            ``NEAR``, left > right if it is entirely nearer.
     """
 
     cam: Array
@@ -54,7 +55,7 @@ class Projection:
     extent: Extent
 
     def box(self, size: Size) -> Box | None:
-        """Return the pixels that the object may touch in an image of (width, height), or None."""
+        """Return the pixels of an image of (width, height) that the object may touch, or None."""
         left, top, right, bottom = self.extent
         if left > right:
             return None
@@ -64,13 +65,13 @@ class Projection:
         return box if box[0] < box[2] and box[1] < box[3] else None
 
     def inside(self, size: Size) -> bool:
-        """Return whether an image of (width, height) shows all of the object's box."""
+        """Return whether all projected vertices lie within an image of (width, height)."""
         left, top, right, bottom = self.extent
         return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
 
 
 def project_object(item: SceneObject, K: Array) -> Projection:
-    """Project an object's vertices."""
+    """Return the projection of an object's vertices by the camera matrix ``K``, pixels."""
     cam, hom = np.empty_like(item.surface.vertices), np.empty_like(item.surface.vertices)
     project_vertices(item.surface.vertices, item.T_cam_obj, K, cam, hom)
     return Projection(cam, hom, bounds(hom, NEAR))
@@ -97,7 +98,7 @@ class Samples(NamedTuple):
     Attributes:
         origin: Image pixel (x, y) of the window's first pixel.
         inverse_depth: 1/m per sample, 0 for empty samples, float32, shape (height, width, S).
-        ids: Triangle per sample, numbered through all objects, −1 for none, int32, same shape.
+        ids: Triangle per sample, counted over all objects, −1 for none, int32, same shape.
     """
 
     origin: tuple[int, int]
@@ -108,9 +109,9 @@ class Samples(NamedTuple):
 def draw_samples(
     scene: Scene, projections: Sequence[Projection], window: Box, offsets: Array
 ) -> Samples:
-    """Draw a scene's plane and objects; the buffers are reused for the next scene.
+    """Return the samples of a scene's plane and objects; the next call overwrites the buffers.
 
-    ``offsets`` are the samples' offsets from the pixel's centre, shape (S, 2).
+    ``offsets`` are the samples' offsets from the pixel's centre, pixels, shape (S, 2).
     """
     left, top, right, bottom = window
     shape = (bottom - top, right - left, len(offsets))
@@ -132,7 +133,7 @@ def draw_samples(
 
 
 def first_ids(scene: Scene) -> Array:
-    """Return the number of every object's first triangle, int64."""
+    """Return the id of every object's first triangle in :attr:`Samples.ids`, int64."""
     counts = [len(item.surface.faces) for item in scene.objects]
     return np.concatenate([[0], np.cumsum(counts)])[: len(counts)].astype(np.int64)
 
@@ -140,7 +141,7 @@ def first_ids(scene: Scene) -> Array:
 def draw_alone(
     item: SceneObject, hom: Array, box: Box
 ) -> tuple[Float32[np.ndarray, "height width"], Array]:
-    """Draw an object alone at a box's pixel centres, also beyond the image.
+    """Rasterise a single object at a box's pixel centres, which may lie beyond the image.
 
     Returns:
         Inverse depth (1/m, 0 outside the object) and triangles (undefined outside the object).
@@ -156,7 +157,7 @@ def draw_alone(
 def backdrop(
     scene: Scene,
 ) -> tuple[RGBImage, Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
-    """Return image, depth and instances of a scene without its objects."""
+    """Return image, depth (metres) and instances of a scene as if it had no objects."""
     depth = np.zeros(scene.background.shape[:2], np.float32)
     if scene.plane is not None:
         _plane_depth(scene.plane.inverse_depth_row(scene.K), NEAR, depth)
@@ -168,7 +169,7 @@ class ShadowMap:
     """A scene's depth from one light.
 
     Attributes:
-        light: Position and linear RGB at one metre, for compiled code.
+        light: Position (camera frame, metres) and linear RGB at one metre, shape (6,).
         inverse_depth: 1/m, 0 for empty texels, shape (height, width, 1).
         P: Projection from the camera frame to homogeneous pixels of the map, the third of which is
             the depth from the light, shape (3, 4), float32.
@@ -209,7 +210,7 @@ def shadow_maps(scene: Scene, projections: Sequence[Projection]) -> list[ShadowM
 def shadow_map(
     light: Light, objects: Sequence[SceneObject], projections: Sequence[Projection], texels: float
 ) -> ShadowMap:
-    """Rasterise objects from a light; the map's longer side has about ``texels``."""
+    """Return the shadow map of a light, with a longer side of about ``texels`` (64 to 768)."""
     points = np.concatenate([transform(item.T_cam_obj, item.surface.hull) for item in objects])
     position = np.array(light.position, np.float64)
     forward = (points.min(axis=0) + points.max(axis=0)) / 2 - position
@@ -243,7 +244,7 @@ def shadow_map(
 
 
 def ambient_row(ambient: Ambient) -> Array:
-    """Return the up direction and the light from above and below, for compiled code."""
+    """Return ``up``, ``above`` and ``below`` of the ambient light as float32, shape (9,)."""
     return np.array([*ambient.up, *ambient.above, *ambient.below], np.float32)
 
 
@@ -284,7 +285,7 @@ def _compare(points: Array, inverse_depth: Array, lit: Array) -> None:
 def _clear_to_plane(
     inverse: Array, origin: tuple[int, int], samples: Array, near: float, inverse_depth: Array
 ) -> None:
-    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not visible."""
+    """Fill a sample buffer with the plane's inverse depth, 1/m; 0 where it is not visible."""
     height, width, num_samples = inverse_depth.shape
     row = inverse_depth.reshape(height, width * num_samples)
     steps = np.empty(width * num_samples, np.float32)
