@@ -1,4 +1,4 @@
-"""Break rates down by bins of a quantity, such as the distance, to show where a method fails.
+"""Break pass rates down by bins of a quantity, such as the distance, to show where methods fail.
 
 To add a quantity, write a function of the instances of one object and add it to :data:`QUANTITIES`
 and in :data:`dopepp.experiment.config.run_config.QuantityName`.
@@ -113,14 +113,14 @@ def break_down(
     num_bins: int,
     rates: Sequence[PassRate],
 ) -> tuple[list[Bin], list[Value]]:
-    """Measure rates per bin over the instances of all objects.
+    """Measure pass rates in bins of a quantity, over the instances of all objects.
 
-    The last method scores all objects, so its instances determine the bins.
+    The last method is measured on all objects, so its instances determine the bins.
 
     Returns:
         The bins in ascending order, and the values of each method per bin: number of instances,
-        rates, median rotation error of matched instances (degrees, to the nearest symmetry) and
-        miss rate. The condition of a value is the middle of its bin.
+        rates, median rotation error of matched instances (degrees, smallest over the symmetries)
+        and miss rate. The condition of a value is the middle of its bin.
     """
     instances = {name: _instances(each, quantity, rates) for name, each in metrics.items()}
     quantities = next(reversed(instances.values()))["quantity"]
@@ -141,7 +141,7 @@ def break_down(
 def _instances(
     metrics: PoseMetrics, quantity: QuantityName, rates: Sequence[PassRate]
 ) -> pd.DataFrame:
-    """Return the quantity, the rotation error and the passed rates of all instances."""
+    """Return a table of all instances: quantity, rotation error (degrees), and passed rates."""
     tables = []
     for gathered in map(metrics.instances, metrics.parts):
         passed = {rate.field: rate.passed(gathered).numpy() for rate in rates}
@@ -153,7 +153,7 @@ def _instances(
 def _in_bin(
     method: str, limits: Bin, table: pd.DataFrame, rates: Sequence[PassRate]
 ) -> Iterator[Value]:
-    """Measure one method in one bin; rates without instances are NaN."""
+    """Yield the values of one method in one bin; rates without instances are NaN."""
     value, num = Value(method, MEAN, condition=limits.middle), len(table)
     yield value._replace(measure="num_instances", value=num)
     for rate in rates:

@@ -86,13 +86,13 @@ _TOO_WIDE: Final = (
 
 
 def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:
-    """Compare methods that were measured together; ``baseline`` is a method's name."""
+    """Write the comparison of methods measured together; Δ refers to the method ``baseline``."""
     entries = [Entry(report.name, [report], [None]) for report in reports]
     write_comparison(baseline_first(entries, baseline), folder)
 
 
 def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
-    """Print and write the table and the AUC curves; return the content of ``compare.md``."""
+    """Print and write the comparison table and accuracy curves; return ``compare.md``'s content."""
     table = comparison_frame(entries)
     means = [report.mean for entry in entries for report in entry.reports]
     compact = compact_table(table, any(row.num_symmetries > 1 for row in means))
@@ -133,7 +133,7 @@ def compare_paths(
         out: New folder (default: a folder below ``outputs/compare``).
         baseline: Method that Δ refers to (default: ``dope``, else the first method).
         num_pictures: Number of test images on which every model predicts.
-        table: File of an experiment whose table layout is used in addition.
+        table: Experiment file in ``conf/experiment``, whose table layout is written in addition.
 
     Raises:
         UserError: A path holds no run, the baseline is not among the methods, the experiment has no
@@ -253,9 +253,10 @@ def read_log_column(path: Path, column: str) -> dict[int, float]:
 
 
 def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
-    """Predict on the first test images of the first method whose images can be opened.
+    """Draw the predictions of all methods on the first ``num`` test images.
 
-    The first seed of each method is shown. Networks of different parts have separate rows.
+    The images are from the first method whose test set can be opened. The first seed of each method
+    is shown. Networks of different parts have separate rows.
 
     Returns:
         Tiles row by row (one row per image, one tile per method), and why images are missing.
@@ -293,7 +294,7 @@ class _Model:
             self.reason = str(error)
 
     def test_images(self, num: int) -> list[Sample]:
-        """Open the images on which the run was measured."""
+        """Return the first ``num`` images on which the run was measured."""
         assert self.estimator is not None
         stored, config = stored_config(self.estimator.checkpoint.data), self.run.config
         # Only the config of an evaluation contains changes to the data of the checkpoint.

@@ -131,7 +131,7 @@ class Entry:
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
-    """Read each folder of runs, evaluations and multiruns once.
+    """Read the runs in folders of trainings, evaluations and multiruns, each folder once.
 
     Raises:
         UserError: A path holds no run.
@@ -141,7 +141,7 @@ def find_runs(paths: Sequence[Path]) -> list[Run]:
 
 
 def _folders(path: Path) -> list[Path]:
-    """Return the run folders in a folder, which must be a run or a multirun."""
+    """Return the folder itself if it holds a run, or the numbered job folders of a multirun."""
     if any((path / trace).exists() for trace in _TRACES):
         return [path]
     jobs = [job for job in path.iterdir() if job.name.isdigit()] if path.is_dir() else []

@@ -107,7 +107,7 @@ class Condition:
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Check that all methods are networks: a file has no poses on the changed images.
+        """Check that all methods are estimators: a file has no poses on the changed images.
 
         Raises:
             UserError: A method is a file of poses.
@@ -154,9 +154,9 @@ class Level:
     """Measurement at one level of a condition, such as 40 % shading.
 
     Attributes:
-        value: Level.
-        rows: Rows of all objects and their mean, by method.
-        facts: Further columns of the CSV file, over all objects.
+        value: Covered share or scale.
+        rows: Rows of all objects and their mean, by method and object.
+        facts: Further columns of the CSV file by heading, measured over all objects.
         note: Remark for the reader, or an empty string.
     """
 
@@ -229,7 +229,7 @@ def record_condition(
 def _values(
     levels: Sequence[Level], fields: Sequence[str], rates: Sequence[PassRate]
 ) -> Iterator[Value]:
-    """Yield the measured values by method, object and level."""
+    """Yield the measured values, ordered by method, object and level."""
     rated = [rate.field for rate in rates]
     for method, rows in levels[0].rows.items():
         for name in shown_rows(rows):
@@ -241,7 +241,7 @@ def _values(
 
 
 def check_masks(source: SampleSource) -> None:
-    """Check early that the images have instance masks.
+    """Check, before anything is measured, that the images have instance masks.
 
     Raises:
         UserError: No image has an instance mask.
@@ -319,7 +319,7 @@ def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[
 
 
 def _examples(sample: Sample, shaded: Sequence[ShadedSample]) -> list[Tile]:
-    """Return tiles of the objects without shading and at every share."""
+    """Return tiles of an image's objects: without shading, and at every share."""
     window = _around_masks(sample)
     tiles = [Tile(sample.image[window], f"{sample.key}: unmasked")]
     for variant in shaded:
@@ -332,7 +332,7 @@ def _examples(sample: Sample, shaded: Sequence[ShadedSample]) -> list[Tile]:
 
 
 def _around_masks(sample: Sample) -> tuple[slice, slice]:
-    """Return row and column slices around all masks, with a margin."""
+    """Return row and column slices around all masks of an image, with a margin."""
     masks = [instance.mask for instance in sample.instances if instance.mask is not None]
     shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
     left, top, width, height = cv2.boundingRect(np.uint8(shown if shown.any() else ~shown))
@@ -398,7 +398,7 @@ def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
 
 
 def _visible_fractions(measured: Measured) -> Float[np.ndarray, "n"]:
-    """Return the visible fractions of all instances; the last method scores all objects."""
+    """Return each instance's visible fraction, from the last method, which has all objects."""
     metrics = next(reversed(measured.metrics.values()))
     gathered = [metrics.instances(name).visible_fractions for name in metrics.parts]
     return np.concatenate([fractions.numpy() for fractions in gathered])

@@ -189,7 +189,7 @@ def time_frames(
     Args:
         estimator: Estimator to time.
         samples: Images, which are used in turn.
-        geometry: Geometry of the maps.
+        geometry: Geometry of the simulated maps.
         num_frames: Number of timed frames.
         seed: Seed of the noise on the maps.
 
@@ -249,9 +249,9 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
 
 
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
-    """Measure the untrained network of a spec at width 1.
+    """Return the cost of the untrained network of a spec, widened to ``width`` 1.
 
-    The time is the median of three forward passes after an untimed pass.
+    The time is the median of three forward passes on the CPU after an untimed pass.
 
     Args:
         spec: Spec of the network.

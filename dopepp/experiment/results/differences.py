@@ -68,15 +68,15 @@ COMPARED: Final[dict[str, tuple[Counted, StatisticName]]] = {
 
 
 def comparable(entry: Entry, baseline: Entry) -> bool:
-    """Return whether two methods were measured on the same images."""
+    """Return whether two methods have the same known fingerprint of test images."""
     return bool(entry.test_set) and entry.test_set == baseline.test_set
 
 
 def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Value]:
-    """Return the differences between two methods on an object, by field of ``PoseRow``.
+    """Return Δ of a method to a baseline on an object or ``mean``, by field of ``PoseRow``.
 
-    The bootstrap draws seeds in pairs if both methods have the same seeds. Values of methods that
-    cannot be compared have no ``num_differing``.
+    The bootstrap samples seeds in pairs if both methods have the same seeds. For methods that
+    cannot be compared, ``num_differing`` is NaN.
     """
     values = {field: Value(entry.name, name, f"{DELTA}{field}") for field in COMPARED}
     objects = _scored(entry, name)
@@ -110,7 +110,7 @@ def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Va
 
 
 def _scored(entry: Entry, name: str) -> list[str]:
-    """Return the objects with instances behind a row: one object, or all for the mean."""
+    """Return the objects with instances that a row averages: one object, or all for ``mean``."""
     errors = entry.reports[0].errors
     return sorted(part for part in errors if len(errors[part]) and name in (part, MEAN))
 
@@ -131,7 +131,7 @@ def comparison_frame(entries: Sequence[Entry]) -> pd.DataFrame:
 
 
 def _values(entries: Sequence[Entry]) -> Iterator[Value]:
-    """Yield the values of the frame, entry by entry."""
+    """Yield the values of :func:`comparison_frame`, one per seed, method by method."""
     baseline = next((entry for entry in entries if entry.reports), None)
     for entry in entries:
         if entry.failure:
@@ -160,7 +160,7 @@ def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 
 
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
-    """Yield the cost in this run and, for a narrowed network, the cost at full size."""
+    """Yield the cost of a method and, for a narrowed network, the cost at full width."""
     costs = {"": entry.cost}
     if entry.reports and (full_size := entry.reports[0].details.get(FULL_SIZE_COST)) is not None:
         costs["full-size "] = Cost(**full_size)
@@ -181,7 +181,7 @@ def compact_table(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
     several = _has_seeds(table)
 
     def cells(value: Value) -> Row:
-        """Return the cells of a value: text, deviation, interval and verdict."""
+        """Return the labels of a value's row, and the value with deviation or interval."""
         return _labels(value, several) | ({value.heading: value.summary} if value.measure else {})
 
     return pivot(values_of(table[table["measure"].isin(chosen)]), ("method", "object"), cells)
@@ -207,7 +207,7 @@ def full_table(table: pd.DataFrame) -> list[Row]:
 
 
 def _labels(value: Value, with_seeds: bool) -> Row:
-    """Return the labels of a row; only pose measures have seeds."""
+    """Return the labels of a row: method, object and, for pose measures, seeds."""
     if not with_seeds or value.measure not in FIELDS:
         return value.names
     return {**value.names, "seeds": ", ".join(map(str, value.seeds))}
@@ -240,7 +240,7 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
 def _baseline_notes(
     baseline: Entry, others: Sequence[Entry], doubts: Sequence[str]
 ) -> Iterator[str]:
-    """Yield sentences about the baseline, the intervals (with ``doubts``) and methods without Δ."""
+    """Yield sentences: baseline and intervals, ``doubts`` (on noise), and methods without Δ."""
     alike = [entry for entry in others if comparable(entry, baseline)]
     if alike:
         yield _interval_note(baseline, alike)
@@ -276,7 +276,7 @@ def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
 
 
 def noise_notes(table: pd.DataFrame) -> list[str]:
-    """Return sentences that list, by method and object, the differences that may be chance."""
+    """Return sentences that list, by method and object, the differences within noise."""
     changes = table[table["num_differing"].notna()]
     several = changes["object"].nunique() > 1
     sentences = []
@@ -294,7 +294,7 @@ def noise_notes(table: pd.DataFrame) -> list[str]:
 
 
 def _needed(change: Value) -> str:
-    """Return a remark on the number of seeds that would make a difference significant."""
+    """Return a remark on how many seeds would make a difference significant, if known."""
     if math.isnan(change.seeds_needed) or change.value == 0:
         return ""
     if math.isinf(change.seeds_needed):

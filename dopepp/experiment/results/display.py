@@ -24,7 +24,7 @@ console = Console(highlight=False, markup=False, width=None if Console().is_term
 
 
 def show_config(config: Mapping[str, Any]) -> None:
-    """Print the composed config as a tree."""
+    """Print a nested config as a tree."""
     tree = Tree(Text("config", style="bold"))
     _branch(tree, config)
     console.print(tree)

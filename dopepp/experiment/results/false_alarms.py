@@ -27,7 +27,7 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 TITLE: Final = "Images without the part"
 KEY: Final = "without_part"
-"""Key of a report's details."""
+"""Key of ``Report.details``: a :class:`FalseAlarms` as a dictionary."""
 
 NUM_LOUDEST: Final = 6
 """Number of images with the highest scores to name and to draw."""
@@ -51,7 +51,7 @@ class FalseAlarms:
     loudest: dict[str, float]
 
     def row(self, method: str) -> Row:
-        """Return a table row."""
+        """Return the texts of a method's table row, by heading."""
         best = next(iter(self.loudest.values()), None)
         return {
             "method": method,
@@ -137,14 +137,14 @@ def count_false_alarms(
 
 
 def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
-    """Draw the best false detection on an image."""
+    """Draw the candidate with the highest score on an image without the part."""
     best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
     label = f"{best.object} {best.score:.3g}"
     return Tile(overlay(sample.image, [Wireframe(best.keypoints, YELLOW, label)]), sample.key)
 
 
 def alarm_rows(report: Report) -> list[Row]:
-    """Return the table of a method and its refined poses; empty without images."""
+    """Return the table rows of a method and its refined poses, if false detections were counted."""
     reports = [report] if report.refined is None else [report, report.refined]
     return [
         FalseAlarms(**each.details[KEY]).row(each.name) for each in reports if KEY in each.details

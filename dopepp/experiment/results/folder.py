@@ -47,7 +47,7 @@ _MAX_UNTRACKED: Final = 100
 
 
 def write_config(run_dir: Path, config: Mapping[str, Any]) -> None:
-    """Write the resolved config."""
+    """Write the resolved config as ``config.yaml``."""
     text = yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True)
     write_file(run_dir / CONFIG_FILE, text.encode())
 
@@ -78,12 +78,12 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_environment(
     run_dir: Path, seed: int, data_fingerprint: str, changes: Sequence[str] = ()
 ) -> None:
-    """Write the environment of a run; a resumed run keeps its earlier environments.
+    """Write the environment of a run to ``versions.json``, after those of interrupted attempts.
 
     Args:
         run_dir: Run folder.
         seed: Seed of the run.
-        data_fingerprint: Fingerprint of the data.
+        data_fingerprint: Hash of the data; empty if unknown.
         changes: Changes of the config since the run began or was last resumed.
     """
     path = run_dir / VERSIONS_FILE

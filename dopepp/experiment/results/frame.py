@@ -41,7 +41,7 @@ FIELDS: Final = {column.field: column for column in COLUMNS}
 """Columns of the pose measures by their field of ``PoseRow``."""
 
 NOMINAL: Final = np.linspace(0.05, 0.95, 19)
-"""Levels of the covariance regions whose coverage is measured."""
+"""Nominal probabilities of the covariance regions whose coverage is measured."""
 
 WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
@@ -90,7 +90,7 @@ class Value(NamedTuple):
 
     @property
     def names(self) -> Row:
-        """Labels of a table row."""
+        """Method and object, the labels of a table row."""
         return {"method": self.method, "object": self.object}
 
     @property
@@ -114,7 +114,7 @@ class Value(NamedTuple):
 
     @property
     def heading(self) -> str:
-        """Column heading with the unit."""
+        """Column heading of the measure, with its unit."""
         return f"{DELTA if self.is_change else ''}{self.column.heading}"
 
     @property
@@ -129,7 +129,7 @@ class Value(NamedTuple):
 
     @property
     def spread(self) -> str:
-        """Text of the standard deviation; empty for a single seed."""
+        """Text of the standard deviation over seeds; empty for a single seed."""
         if len(self.seeds) < 2 or self.is_change:
             return ""
         decimals = max(self.column.decimals, 1)
@@ -138,7 +138,7 @@ class Value(NamedTuple):
 
     @property
     def ends(self) -> list[str]:
-        """Texts of the interval's ends; empty without an interval."""
+        """Texts of the ends of the 95 % interval; empty without an interval."""
         return [] if math.isnan(self.low) else [self._shown(self.low), self._shown(self.high)]
 
     @property
@@ -151,13 +151,13 @@ class Value(NamedTuple):
 
     @property
     def plain(self) -> int | float | None:
-        """Value for CSV files: counts are integers, None becomes an empty cell."""
+        """Value for CSV files: an integer for a count; None, an empty cell, for NaN."""
         if math.isnan(self.value):
             return None
         return int(self.value) if self.measure.startswith("num_") else self.value
 
     def _shown(self, value: float) -> str:
-        """Return a number in the unit and format of its column."""
+        """Format a number in the unit of its column, with a sign for a difference."""
         return self.column.format(None if math.isnan(value) else value, signed=self.is_change)
 
 
@@ -180,7 +180,7 @@ def row_values(
     rates: Sequence[str] = (),
     condition: float = 0.0,
 ) -> Iterator[Value]:
-    """Yield the values of some fields of a row; fields in ``rates`` have an interval."""
+    """Yield the values of ``fields`` of a row; those in ``rates`` have a 95 % interval."""
     for field in fields:
         value = getattr(row, field)
         value = math.nan if value is None else float(value)
@@ -212,7 +212,7 @@ def means(frame: pd.DataFrame) -> pd.DataFrame:
 def pivot(
     values: Iterable[Value], keys: Sequence[str], cells: Callable[[Value], Mapping[str, Cell]]
 ) -> list[dict[str, Cell]]:
-    """Merge the cells of all values with equal keys into one table row."""
+    """Return a table row per combination of ``keys``, merged from the cells of its values."""
     rows: dict[tuple[object, ...], dict[str, Cell]] = {}
     for value in values:
         rows.setdefault(tuple(getattr(value, key) for key in keys), {}).update(cells(value))
@@ -242,7 +242,7 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def radius_note(radii: Mapping[str, float]) -> str:
-    """Return a sentence about the matching radius (metres) of each object."""
+    """Return a sentence with the matching radius of each object, given in metres by name."""
     listed = ", ".join(f"{name} {1000 * radius:.0f} mm" for name, radius in radii.items())
     return f"Matching radius, half a diameter and at most 10 cm: {listed}."
 
@@ -282,7 +282,7 @@ class PassRate:
 
     Attributes:
         field: Field of :class:`~dopepp.metrics.row.PoseRow`.
-        error: Kind of error.
+        error: Error that is compared with the threshold.
         threshold: Threshold in diameters if ``relative``, else in metres.
         relative: Whether the threshold scales with the diameter of the object.
     """
@@ -294,11 +294,11 @@ class PassRate:
 
     @property
     def title(self) -> str:
-        """Title of the rate's curves."""
+        """Title of the rate's curves: its heading without the unit."""
         return heading(self.field).removesuffix(" %")
 
     def passed(self, instances: EvaluatedInstances) -> Bool[Tensor, "n"]:
-        """Return which instances of an object pass."""
+        """Return which instances of an object have an error below the threshold."""
         unit = instances.part.diameter if self.relative else 1.0
         errors: Tensor = getattr(instances.errors, self.error)
         return errors < self.threshold * unit

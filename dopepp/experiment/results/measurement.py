@@ -59,7 +59,7 @@ class ScoredPose(PredictedPose, Protocol):
 
     @property
     def keypoints(self) -> Float[np.ndarray, "9 2"]:
-        """Projected cuboid, pixels."""
+        """Projected corners and centroid of the cuboid, pixels."""
 
 
 class Method(Protocol):
@@ -77,11 +77,11 @@ class Method(Protocol):
         """Return all candidates in an image, and the time in seconds, or None if unknown."""
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Return the cost of the method, given the known times of all images in order."""
+        """Return the cost of the method, given the known seconds of the images in order."""
 
 
 def reported_candidates(method: Method, candidates: Sequence[ScoredPose]) -> list[ScoredPose]:
-    """Return the candidates that a method reports."""
+    """Return the candidates with a score of at least ``method.min_score``."""
     return [candidate for candidate in candidates if candidate.score >= method.min_score]
 
 
@@ -200,7 +200,7 @@ class FileMethod:
         return poses, seconds if seconds >= 0 else None
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Return the median of the images' times in the file."""
+        """Return a cost with the median time per image that the file states."""
         return Cost(ms_per_frame=_median_ms(seconds))
 
     def check_used(self) -> None:
@@ -363,7 +363,7 @@ def _with_precision(
 
 
 def depth_drawer() -> Draw:
-    """Return a function that draws the depth of a single part; meshes are prepared once."""
+    """Return a function that renders the depth map of a single part in metres; 0 without depth."""
     surfaces: dict[str, Surface] = {}
 
     def draw(part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:

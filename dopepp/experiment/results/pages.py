@@ -124,7 +124,7 @@ class RunReadme:
         self._begun = False
 
     def begin(self) -> None:
-        """Write that the run is in progress, with its process."""
+        """Write the README of a run in progress, with its start time, process and machine."""
         self._begun = True
         since = datetime.now().astimezone().isoformat(" ", "seconds")
         self.end(
@@ -134,7 +134,7 @@ class RunReadme:
         )
 
     def end(self, state: str, reason: str = "", report: Report | None = None) -> None:
-        """Write the final state, the reason and the result."""
+        """Write the README with a state, such as ``finished``, its reason and any result."""
         if not self._begun:
             return
         title = f"{self._config.model.name} on {self._config.data.name}: {state}"
@@ -143,7 +143,7 @@ class RunReadme:
         write_run_readme(self._folder, title, report, reason, commands, is_trial)
 
     def _next_commands(self, state: str, report: Report | None) -> list[str]:
-        """Return the commands that a user may want to run after this state."""
+        """Return suggested shell commands for a run in this state."""
         run = shlex.quote(program.relative_path(self._folder))
         checkpoint = {} if report is None else report.details
         best = self._folder / checkpoint.get("checkpoint", BEST_CHECKPOINT)
@@ -176,7 +176,7 @@ def write_run_readme(
     Args:
         folder: Run folder.
         title: Title of the page.
-        report: Result on the test set.
+        report: Result on the test set, if measured.
         reason: Sentence on the state of the run, or on the reason for its end.
         next_commands: Suggested commands.
         is_trial: Whether the run is a trial of a search, which keeps no checkpoints.
@@ -201,7 +201,7 @@ def write_run_readme(
 
 
 def _result_table(name: str, rows: Sequence[PoseRow]) -> str:
-    """Return the table of an object as printed in the terminal, without its title."""
+    """Return the Markdown table of an object: a line per measure, a column per method."""
     lines = []
     for measure in shown_columns(rows[0]):
         lines.append({name: measure.heading, **{row.method: measure.text(row) for row in rows}})
@@ -229,7 +229,7 @@ def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[st
 
 
 def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Path]:
-    """Write ``NAME.safetensors`` and its card ``NAME.md``; return both paths.
+    """Write the weights ``NAME.safetensors`` and the model card ``NAME.md``; return both paths.
 
     Args:
         checkpoint: Checkpoint to release.

@@ -131,11 +131,11 @@ class PaperTable:
         return _PASS_FIELDS[self.threshold]
 
     def field(self, key: str) -> str:
-        """Return the field of ``PoseRow`` for a key of a config's values."""
+        """Return the field of ``PoseRow`` for a measure in the config, such as ``pass``."""
         return self.pass_field if key == "pass" else key
 
     def printed(self, label: str, measure: str) -> str:
-        """Return the text of a value that the paper prints for a network."""
+        """Return the text of a measure that the paper prints for a network; empty without any."""
         return _number(self.paper.get(label, {}).get(_NETWORK, {}).get(measure))
 
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
@@ -279,7 +279,7 @@ def _number(value: float | None) -> str:
 
 
 def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
-    """Return the pass rates at every share with the paper's values and Δ, and plot their curves.
+    """Return the pass rates at every covered share, the paper's and Δ, and plot their curves.
 
     Rates are means over seeds. Δ refers to the first method at the same share, or to the first
     refined method for refined poses. The interval of Δ is Student's t interval of the differences
@@ -355,7 +355,7 @@ def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
 
 
 def _by_share(points: pd.DataFrame, text: Callable[[pd.Series[float]], str]) -> Row:
-    """Return a text for the numbers of all seeds at every share."""
+    """Return, by heading of each covered share, the text for the numbers of all seeds."""
     return {SHADING.heading(share): text(column.dropna()) for share, column in points.items()}
 
 
@@ -417,7 +417,7 @@ def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 def _cost_rows(
     methods: Mapping[str, Entry], row: Callable[[str, Mapping[str, Any]], Row]
 ) -> list[Row]:
-    """Return a row per network, then the networks without a measured cost."""
+    """Return a row per network with a cost file, then a row per network that failed."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
     costs = {label: read_json(path) for label, path in paths.items() if path.is_file()}
     rows = [{_METHOD: label, **row(label, cost)} for label, cost in costs.items()]
@@ -426,7 +426,7 @@ def _cost_rows(
 
 
 def _failed(label: str, entry: Entry) -> str:
-    """Return a line about a network that was not measured."""
+    """Return a network's label with the reason why it was not measured."""
     return f"{label}: {entry.failure or 'not measured'}"
 
 

@@ -70,11 +70,11 @@ def measure_and_record(
         data: Test data.
         run_dir: Run folder.
         num_pictures: Number of test images to draw.
-        details: Further plain values for ``metrics.json``.
+        details: Further JSON values for ``metrics.json``, by key.
         results: BOP challenge CSVs of other methods, by name.
         bop_csv: Whether to write the poses of each method.
         all_measures: Whether to print symmetric measures of objects without symmetries.
-        protocols: Further protocols to measure.
+        protocols: Further measurements, such as shading.
         refine: Refinement to measure in addition, for every estimator.
         without_parts: Images without the parts, on which detections are counted.
 
@@ -157,7 +157,7 @@ def measure_and_record(
 
 
 def of_networks(reports: list[Report], num_files: int) -> list[Report]:
-    """Return the reports of the estimators, or of the files if there is no estimator."""
+    """Return the reports without the last ``num_files``, or all reports if none remains."""
     return reports[: len(reports) - num_files] or reports
 
 
@@ -169,7 +169,7 @@ def main_report(reports: Sequence[Report]) -> Report:
 def with_refining(
     estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
 ) -> dict[str, PoseEstimator]:
-    """Return every estimator, each network followed by a refining copy if ``refine`` is set."""
+    """Return the estimators by name; with ``refine``, a refining copy follows each network."""
     pairs: dict[str, PoseEstimator] = {}
     for name, estimator in estimators.items():
         pairs[name] = estimator
@@ -212,7 +212,7 @@ def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
 
 
 def _record_coverage(run_dir: Path, measured: Measured) -> None:
-    """Draw the coverage of every method and object, and add it to the reports."""
+    """Draw observed over nominal coverage of the pose covariances, and add it to the reports."""
     curves: dict[str, RateCurve] = {}
     for report in measured.reports:
         metrics = measured.metrics[report.name]
@@ -256,7 +256,7 @@ def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
 def _show_rejections(
     methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: SampleSource
 ) -> None:
-    """Print the number of images without detections of each estimator, with the reasons."""
+    """Print how many images, of the indices ``silent``, have no detection, and the reasons."""
     for name, numbers in silent.items():
         method = methods[name]
         if numbers and isinstance(method, EstimatorMethod) and method.estimator.has_network:

@@ -53,12 +53,12 @@ class Report:
 
     Attributes:
         name: Name of the method.
-        rows: Rows of all objects, followed by their mean.
-        references: Rows of each reference method.
+        rows: Rows of all objects by name, followed by their mean.
+        references: Rows by object of each reference, a guess that ignores the image's content.
         errors: ADD of every instance by object, metres.
         cost: Cost of the method.
         num_images: Number of test images.
-        details: Further plain values for ``metrics.json``.
+        details: Further JSON values for ``metrics.json``, by key.
         rotation_deg: Rotation error of every instance by object, degrees.
         diameters: Diameters of the objects, metres.
         test_set: Fingerprint of the test set; empty if unknown.
@@ -79,7 +79,7 @@ class Report:
 
     @property
     def mean(self) -> PoseRow:
-        """Mean over objects."""
+        """Row with the mean of each measure over the objects."""
         return self.rows[MEAN]
 
     @property
@@ -161,12 +161,12 @@ class Report:
 
 
 def _rows(record: Mapping[str, Mapping[str, Any]]) -> dict[str, PoseRow]:
-    """Restore table rows from plain values."""
+    """Restore table rows by object from JSON values."""
     return {name: PoseRow(**row) for name, row in record.items()}
 
 
 def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
-    """Join the rows of several tables and recompute the mean."""
+    """Join the rows of several tables of different objects, and recompute the mean."""
     rows = {name: row for group in groups for name, row in group.items() if name != MEAN}
     return {**rows, MEAN: mean_row(list(rows.values()), groups[0][MEAN].method)}
 
@@ -199,7 +199,7 @@ class Fingerprint:
         self._add(sorted((part.name, part.mesh_hash) for part in parts))
 
     def add(self, sample: Sample) -> None:
-        """Add the next image."""
+        """Add an image's source, name, size, camera and true poses to the hash."""
         truths = []
         for instance in sample.instances:
             counts = bool(instance.visible_fraction >= MIN_VISIBLE_FRACTION)
@@ -212,10 +212,10 @@ class Fingerprint:
         return self._hash.hexdigest()
 
     def _add(self, facts: object) -> None:
-        """Add plain values to the hash."""
+        """Add JSON values to the hash."""
         self._hash.update(json.dumps(facts).encode() + b"\n")
 
 
 def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
-    """Round numbers and replace negative zeros by zero."""
+    """Round numbers to :data:`_DECIMALS` and replace negative zeros by zero."""
     return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
