@@ -47,7 +47,7 @@ _REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENO
 
 
 def train(config: DictConfig) -> float | None:
-    """Run one job of ``train.py``; return its objective in a multirun (:func:`run_job`)."""
+    """Run one job of ``train.py``; return its best validation score in a multirun, else None."""
     return run_job(config, _imported("dopepp.experiment.run.train:do_job"))
 
 
@@ -57,7 +57,7 @@ def evaluate(config: DictConfig) -> None:
 
 
 def _imported(name: str) -> Job:
-    """Return a job that imports ``MODULE:FUNCTION`` when it runs, because PyTorch loads slowly."""
+    """Return a job that imports ``name`` (module:function) only when it runs, for a fast start."""
     return lambda config, run_dir: resolve_name(name)(config, run_dir)
 
 
@@ -127,7 +127,6 @@ def entry(
 
 
 def _exit(line: object, code: int) -> None:
-    """Print a line on stderr and exit with a code."""
     sys.stdout.flush()
     sys.stderr.write(f"{line}\n")
     raise SystemExit(code)

@@ -32,7 +32,7 @@ def build_parts(data: DataConfig) -> list[Part]:
 
 
 def _read_parts(data: DataConfig) -> list[Part]:
-    """Load the objects of a YCB-Video or BOP root, or the names and mesh files in ``parts``."""
+    """Load the objects of ``data.root`` (YCB-Video, BOP), else the parts that ``parts`` lists."""
     if data.root is None:
         for option, value in (("objects", data.objects), ("frames", data.frames)):
             if value is not None:
@@ -60,7 +60,7 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
 
 
 def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
-    """Load the parts to show unlabelled: ``virtual.negatives`` and the other models of BOP."""
+    """Load the parts that renders show unlabelled: ``virtual.negatives``, other models of BOP."""
     listed = [load_part(name, data.unit) for name in data.virtual.negatives]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed

@@ -160,7 +160,7 @@ def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> 
 def _synthetic_images(
     data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource | None:
-    """Open the transparent synthetic images in YCB-Video's training list; None without any."""
+    """Open the synthetic images in YCB-Video's training list, over ``backgrounds``, if any."""
     image_set = data.image_sets["train"]
     if data.root is None or data.format != "ycb_video" or image_set is None:
         return None
@@ -233,7 +233,7 @@ FORMATS: Final[dict[str, Opener]] = {
 
 
 def note_on_shared_folder(data: DataConfig) -> str | None:
-    """Return a remark if the test images are only a share of their folder, else None."""
+    """Return a remark if other splits use a share of the test images' folder, else None."""
     if data.is_rendered("test") or data.format not in _DIVIDED:
         return None
     first, last = share_of(data.image_sets, "test")

@@ -301,7 +301,7 @@ def _loading_s(datamodule: PoseDataModule) -> float:
 
 
 def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precision: str) -> float:
-    """Return the seconds per image of forward and backward pass, in a batch of at most 2 s."""
+    """Return the seconds per image of a forward and backward pass that takes at most 2 s."""
     width, height = datamodule.input_size
 
     def step_s(count: int) -> float:

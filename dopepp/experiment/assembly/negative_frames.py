@@ -108,7 +108,7 @@ def negative_frames(
 
 
 def frame_view(data: DataConfig, parts: Parts) -> View:
-    """Return the camera of the frames and the distances of the parts.
+    """Return the camera of :func:`negative_frames` and the range of distances of the parts.
 
     The camera is ``virtual.camera`` if set. Otherwise the camera has the preset's focal length and
     images of at least :data:`FRAME` pixels.
@@ -123,7 +123,7 @@ def frame_view(data: DataConfig, parts: Parts) -> View:
 
 
 def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:
-    """Return the smallest and largest depth of the middle of parts in a preset, metres."""
+    """Return the range of depths at which a preset places the middle of a part, metres."""
     if preset.table is not None:
         return preset.table.distance
     rng, depths = np.random.default_rng(0), []

@@ -28,7 +28,7 @@ _NEEDED: Final = f"at least {3 * MIN_PHOTOS} different photos"
 
 
 def training_backgrounds(data: DataConfig) -> Backgrounds:
-    """Return the training backgrounds: ``virtual.backgrounds``, mixed with ``negative_photos``.
+    """Return the training backgrounds: ``virtual.backgrounds``, and ``negative_photos`` if set.
 
     Raises:
         UserError: A folder has no photo, or there are too few negative photos.
@@ -50,7 +50,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
 
 
 def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
-    """Return photos that training does not use: the user's, or the package's without a folder.
+    """Return photos that training does not use, of ``virtual.backgrounds`` or the package.
 
     Raises:
         UserError: The folder of the backgrounds has too few photos to be divided.

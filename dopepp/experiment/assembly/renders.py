@@ -43,7 +43,7 @@ def held_out_renders(
     """Return the renders of the validation or test split, at the camera's full resolution.
 
     Args:
-        data: Options of the data.
+        data: Config of objects and images.
         parts: Parts to render and label.
         split: ``val`` or ``test``.
         scale: Factor by which the distance to the parts is divided.
@@ -84,10 +84,10 @@ def validation_renders(
     The training's data set is not needed; other models of the data set are not shown.
 
     Args:
-        checkpoint: Checkpoint.
+        checkpoint: Checkpoint with the parts and the options of the renders.
         path: Path of the checkpoint, for messages.
         count: Number of images.
-        size: Image size; ignored if the checkpoint was trained for a camera.
+        size: (width, height), pixels; ignored if the checkpoint was trained for a camera.
     """
     data = evaluation_data({}, {}, stored_config(checkpoint.data), str(path))
     virtual = replace(data.virtual, preset=data.preset_name)
@@ -101,7 +101,7 @@ def validation_renders(
 def with_cache(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Return a source with a cache in ``memory`` or on ``disk``, or for ``none`` the source itself.
+    """Cache a source's images, resized to fit ``input_size``, unless ``cache`` is ``none``.
 
     Raises:
         UserError: The cache does not fit into the memory or on the disk.
@@ -115,7 +115,7 @@ def with_cache(
 
 
 def training_preset(data: DataConfig) -> Preset:
-    """Return the preset resized to the network's input or, with a camera, in windows that size."""
+    """Return the scene preset with images, or windows of the camera's images, of input size."""
     preset, view = data.preset, data.virtual.view
     if view is not None:
         return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)
@@ -131,7 +131,7 @@ def _factory(
     backgrounds: Backgrounds,
     renderer: str | None = None,
 ) -> Factory:
-    """Return the factory that renders scenes of a preset, with the configured negatives."""
+    """Return the factory that renders a preset's scenes, with parts of :func:`build_negatives`."""
     return Factory(
         parts,
         preset,

@@ -149,7 +149,7 @@ class DataConfig:
         objects: Objects of the root to learn; None selects the paper's five objects of YCB-Video,
             else all objects.
         parts: Built-in names or mesh files; used without a root and for NDDS.
-        unit: Unit of the mesh files: m, cm, mm or inch; None as in :mod:`dopepp.parts.mesh`.
+        unit: Unit of the mesh files: m, cm, mm or inch; None: m for GLB, as stated in 3MF, else mm.
         symmetries: Symmetries of the objects: None for the data set's symmetries, ``none``,
             ``auto``, a file, or symmetries by object name (:mod:`dopepp.data.part_symmetries`).
         real_fraction: Share of labelled images in an epoch.
@@ -175,7 +175,7 @@ class DataConfig:
         eval_seed: Seed of validation and test renders and of the patches of shading, independent of
             the training seed.
         input_size: Input size (width, height) of the network, pixels, multiples of 32; None selects
-            a size that suits ``virtual.camera``.
+            a square that holds the largest part in the image of ``virtual.camera``.
         batch_size: Images per step and process.
         num_workers: Loader processes; None uses one per core.
 
@@ -262,7 +262,7 @@ class DataConfig:
         return self.input_size
 
     def is_rendered(self, split: Split) -> bool:
-        """Return whether the images of a held-out split are renders."""
+        """Return whether the images of a held-out split, ``val`` or ``test``, are renders."""
         if self.root is None or (split == "test" and self.test.renderer is not None):
             return True
         return self.image_sets[split] is None
@@ -345,7 +345,7 @@ def with_files(virtual: object) -> object:
 
 
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:
-    """Return the user's node ``virtual`` if complete, or the stored node with changed options."""
+    """Parse the user's node if it sets renderer and preset, else the stored node with changes."""
     if not {"renderer", "preset"} <= set(given):  # a file of conf/virtual sets both
         if stored is None:
             problem = f"{source}, which contains no options of the renders"

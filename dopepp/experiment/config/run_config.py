@@ -46,7 +46,7 @@ _MAX_SCALE: Final = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:
-    """The network and its loss: the node ``model``.
+    """The network and its loss: the node ``model``. A node names a class and its arguments.
 
     Attributes:
         name: Name in tables.
@@ -92,7 +92,7 @@ class TrainerConfig:
         precision: Lightning's name of the precision, or ``auto`` for bf16 on suitable hardware.
         max_epochs: Maximum number of epochs.
         max_steps: Maximum number of optimiser steps; -1 sets no limit.
-        profiler: ``simple`` or ``pytorch``.
+        profiler: ``simple`` or ``pytorch``; None for no profile.
         ddp_timeout_s: Time that a process waits for an unresponsive process, seconds.
         lightning: Further arguments of Lightning's Trainer.
     """
@@ -234,7 +234,6 @@ class Protocols:
         )
 
     def __bool__(self) -> bool:
-        """Return whether any measurement is selected."""
         return bool(self.shading or self.scales or self.by)
 
 
@@ -275,8 +274,8 @@ class MeasurementConfig(FalsePositiveTarget):
             (default: none).
         num_bins: Number of bins of each quantity in ``by``.
         tune: Whether to tune a distance factor, a score and its threshold before the measurement.
-        refine: Refinement to measure, and to tune, in addition: ``region`` on the image,
-            ``depth`` on the depth image, or a list of both.
+        refine: Refinement whose poses are measured, and tuned, besides the network's: ``region`` on
+            the image, ``depth`` on the depth image, or a list of both.
         output_dir: Folder of the run folders.
         extensions: User packages whose code may be used (:mod:`dopepp.core.extensions`).
     """
@@ -447,5 +446,5 @@ def flatten(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 def is_below(key: str, nodes: Sequence[str]) -> bool:
-    """Return whether an option is one of the nodes, or belongs to one of the nodes."""
+    """Return whether a dotted option is one of the nodes or lies below one of them."""
     return any(key == node or key.startswith(f"{node}.") for node in nodes)

@@ -41,7 +41,7 @@ Numbers = Float[np.ndarray, "n"]
 
 
 class Quantity(NamedTuple):
-    """Quantity to sort instances by: heading with unit, value per instance, decimals in tables."""
+    """Quantity to bin instances by: heading with unit, value per instance, decimals in tables."""
 
     heading: str
     of: Callable[[EvaluatedInstances], Numbers]
@@ -185,7 +185,6 @@ def record_breakdown(
     by_middle = {each.middle: each for each in bins}
 
     def cells(value: Value) -> Row:
-        """Return the cells of the table that show a value."""
         limits = by_middle[value.condition]
         ends = dict.fromkeys(f"{end:.{decimals}f}" for end in (limits.low, limits.high))
         row = {title: " … ".join(ends)}

@@ -273,7 +273,7 @@ def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list
 
 
 def _parts(run: Run) -> tuple[str, ...]:
-    """Return the names of the parts on which a run was measured."""
+    """Return the sorted names of the parts on which a run was measured; empty without a result."""
     return tuple(sorted(run.report.errors)) if run.report is not None else ()
 
 

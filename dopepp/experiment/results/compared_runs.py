@@ -52,7 +52,7 @@ _LONGEST_NAME: Final = 60
 
 @dataclass
 class Run:
-    """A run folder.
+    """A training, evaluation or cost measurement, as read from its run folder.
 
     Attributes:
         overrides: Overrides of the run, without options of locations.
@@ -155,7 +155,7 @@ def _folders(path: Path) -> list[Path]:
 
 
 def read_run(folder: Path) -> Run:
-    """Read one run folder; missing or damaged files become the run's failure."""
+    """Read one run folder; ``Run.failure`` states which result is missing or damaged."""
     config = _mapping(folder / CONFIG_FILE)
     run = Run(folder, "", overrides_of(folder), None, "", None, config, folder / BEST_CHECKPOINT)
     try:
@@ -207,7 +207,6 @@ def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _without(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
-    """Return a copy of a mapping without some keys."""
     return {key: value for key, value in config.items() if key not in keys}
 
 

@@ -176,7 +176,7 @@ def record_condition(
     """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
 
     Args:
-        run_dir: Run folder.
+        run_dir: Folder for the files.
         condition: Condition that was measured.
         levels: Measurements in ascending order of the level.
         tiles: Examples, image by image, each at all levels.
@@ -304,7 +304,7 @@ def measure_shading(
 
 
 def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[float]) -> Level:
-    """Summarise a level, with a note on instances whose covered share is out of tolerance."""
+    """Summarise a covered share, with a note if instances miss it by more than the tolerance."""
     # The negated comparison also counts unknown shares (NaN).
     num_outside = sum(not abs(covered - share) <= TOLERANCE for covered in reached)
     finite = [covered for covered in reached if np.isfinite(covered)]
@@ -350,11 +350,11 @@ def measure_scales(
     unmoved: Measured,
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:
-    """Measure every method at every scale.
+    """Measure every method at every scale, a factor on the apparent size of the parts.
 
     Args:
         methods: Methods by name.
-        sources: Test set at every scale except 1.
+        sources: Test set by scale, except scale 1.
         unmoved: Measurement at scale 1.
         num_examples: Number of images on the sheet of examples.
 

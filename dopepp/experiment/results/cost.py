@@ -74,8 +74,8 @@ class NetworkCost:
         picture_size: Size of the timed images before they are scaled to the input size.
         threads: Number of CPU threads.
         ms_per_frame: Median time from an image to its poses, milliseconds.
-        network_ms: Share of the network in ``ms_per_frame``.
-        recovery_ms: Share of the recovery (maps to poses) in ``ms_per_frame``.
+        network_ms: Median time of the network within a frame, milliseconds.
+        recovery_ms: Median time of the recovery (maps to poses) within a frame, milliseconds.
         frames_per_s: Throughput of the network alone in batches of ``batch_size``, fastest batch.
     """
 
@@ -213,9 +213,9 @@ def time_frames(
 def likely_maps(
     sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
 ) -> Maps:
-    """Simulate the maps of a trained network: true maps of an image with noise.
+    """Simulate the maps of a trained network: maps drawn from the true poses, with noise.
 
-    The maps have the input size of the estimator and are on its device.
+    The maps are for an image at the estimator's input size, and on its device.
     """
     size = estimator.checkpoint.input_size
     letterbox = Letterbox.fit(sample.size, size)

@@ -116,13 +116,12 @@ def _scored(entry: Entry, name: str) -> list[str]:
 
 
 def _by_seed(entry: Entry) -> list[Report]:
-    """Return an entry's reports in the order of their seeds."""
     pairs = zip(entry.seeds, entry.reports, strict=True)
     return [report for _, report in sorted(pairs, key=lambda pair: str(pair[0]))]
 
 
 def comparison_frame(entries: Sequence[Entry]) -> pd.DataFrame:
-    """Build the frame of a comparison, averaged over seeds, ordered by method and object.
+    """Build the results table of a comparison: means over seeds, ordered by method and object.
 
     The baseline is the first entry with a result (see :func:`_baseline_of`). The reference rows of
     its test set come last. A method without a result has one row, whose object states the reason.
@@ -171,24 +170,23 @@ def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
 
 
 def compact_table(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
-    """Return the compact table, with ``value ± deviation`` and ``Δ [interval]`` as cells.
+    """Return the main measures, with ``value ± deviation`` and ``Δ [interval]`` as cells.
 
     Args:
-        table: Full table of a comparison, one row per value.
+        table: Result of :func:`comparison_frame`.
         symmetric: Whether any object has symmetries.
     """
     chosen = _HEADLINE | _SYMMETRIC if symmetric else _HEADLINE
     several = _has_seeds(table)
 
     def cells(value: Value) -> Row:
-        """Return the labels of a value's row, and the value with deviation or interval."""
         return _labels(value, several) | ({value.heading: value.summary} if value.measure else {})
 
     return pivot(values_of(table[table["measure"].isin(chosen)]), ("method", "object"), cells)
 
 
 def full_table(table: pd.DataFrame) -> list[Row]:
-    """Return the full table, with one cell per measure, deviation, Δ, interval end and verdict."""
+    """Return a table with a cell per measure, deviation, Δ, interval end, and verdict on noise."""
     several = _has_seeds(table)
 
     def cells(value: Value) -> Row:

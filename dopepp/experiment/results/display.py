@@ -31,7 +31,6 @@ def show_config(config: Mapping[str, Any]) -> None:
 
 
 def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
-    """Add the nested values of a config to a tree."""
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
             _branch(tree.add(Text(str(key), style="bold")), value)
@@ -51,7 +50,7 @@ def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:
 
 
 def show_report(report: Report, all_measures: bool = False) -> None:
-    """Print one table per object, with measures as rows and the references as further columns.
+    """Print a table per object: measures as rows; method, refined poses, references as columns.
 
     Args:
         report: Result to print.

@@ -90,7 +90,7 @@ def frames_without_parts(
         folder: Folder of photos, searched recursively.
         camera: Camera file; None for the camera of the data. Images are scaled and cropped to
             the camera's size.
-        data: Test data.
+        data: Config of the test data.
         parts: Parts of the estimators.
 
     Raises:
@@ -112,7 +112,7 @@ def frames_without_parts(
 def count_false_alarms(
     estimators: Mapping[str, PoseEstimator], frames: SampleSource
 ) -> tuple[dict[str, FalseAlarms], list[Tile]]:
-    """Run estimators on images without their parts.
+    """Count the detections of estimators on images without their parts.
 
     Returns:
         The counts by estimator, and tiles of the last estimator's images with the highest

@@ -78,7 +78,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_environment(
     run_dir: Path, seed: int, data_fingerprint: str, changes: Sequence[str] = ()
 ) -> None:
-    """Write the environment of a run to ``versions.json``, after those of interrupted attempts.
+    """Write the :func:`environment` of a run to ``versions.json``, and keep earlier entries.
 
     Args:
         run_dir: Run folder.
@@ -104,7 +104,7 @@ def write_environment(
 
 
 def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
-    """Describe program, packages, working tree, hardware, seed, data and time."""
+    """Return time, command, versions, git state, hardware, seed and data hash as JSON values."""
     gpus = map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
     return {
         "dopepp": dopepp.__version__,

@@ -56,7 +56,7 @@ Cell = TypeVar("Cell")
 
 
 class Value(NamedTuple):
-    """A row of the frame; missing numbers are NaN.
+    """A measured value, a row of the results table; missing numbers are NaN.
 
     Attributes:
         method: Name of the method or of the reference.
@@ -162,12 +162,12 @@ class Value(NamedTuple):
 
 
 def make_frame(values: Iterable[Value]) -> pd.DataFrame:
-    """Build a frame that keeps the order of the values."""
+    """Build a results table with a row per value, in their order."""
     return pd.DataFrame(list(values), columns=Value._fields).astype({"seed": "Int64"})
 
 
 def values_of(frame: pd.DataFrame, **wanted: object) -> list[Value]:
-    """Return the rows of a frame whose columns have the ``wanted`` values."""
+    """Return the rows of a results table whose columns have the ``wanted`` values."""
     chosen = np.ones(len(frame), bool)
     for name, value in wanted.items():
         chosen &= (frame[name] == value).to_numpy(bool)
@@ -195,7 +195,7 @@ def interval(rate: float, num: int) -> tuple[float, float]:
 
 
 def means(frame: pd.DataFrame) -> pd.DataFrame:
-    """Average over seeds: one row per method, object, measure and condition.
+    """Average a results table over seeds: one row per method, object, measure and condition.
 
     The mean is NaN if the value of any seed is missing, because a mean over the remaining seeds
     would be biased.
@@ -281,7 +281,7 @@ class PassRate:
     """Share of instances whose error is below a threshold.
 
     Attributes:
-        field: Field of :class:`~dopepp.metrics.row.PoseRow`.
+        field: Field of :class:`~dopepp.metrics.row.PoseRow` with this rate.
         error: Error that is compared with the threshold.
         threshold: Threshold in diameters if ``relative``, else in metres.
         relative: Whether the threshold scales with the diameter of the object.

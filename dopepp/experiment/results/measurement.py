@@ -105,7 +105,7 @@ class EstimatorMethod:
 
     @property
     def takes_views(self) -> bool:
-        """Whether the estimator can estimate poses from several views."""
+        """Whether the estimator accepts several views: its refinement verifies poses."""
         return self.estimator.refiner is not None and self.estimator.refiner.verifies
 
     def rejection(self, sample: Sample) -> Reason | None:
@@ -116,7 +116,7 @@ class EstimatorMethod:
         return next((reason for reason in reversed(reasons) if reason.object in self._names), None)
 
     def cost(self, seconds: Sequence[float]) -> Cost:
-        """Return parameters, operations and the median time per frame."""
+        """Return the number of parameters, the operations and the median time per frame."""
         milliseconds = _median_ms(seconds[_WARM_UP_FRAMES:] or seconds)
         if not self.estimator.has_network:
             return Cost(ms_per_frame=milliseconds)
@@ -380,7 +380,7 @@ def depth_drawer() -> Draw:
 
 
 def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
-    """Return a metric accumulator for each method."""
+    """Return an empty accumulator of pose metrics for each method, by name."""
     # Only one process measures: after a distributed training the other processes have ended.
     return {
         name: PoseMetrics(method.parts, name, sync_on_compute=False)

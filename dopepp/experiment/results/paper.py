@@ -173,7 +173,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
 
 
 def _recipe(entries: Sequence[Entry]) -> list[str]:
-    """Return a remark on the recipe (loss and schedule) of the networks."""
+    """Return a title text with the recipes (loss and schedule) of the networks, if known."""
     words = {str(run.config.get("recipe")) for entry in entries for run in entry.runs}
     recipes = sorted(words & {"ours", "paper"})
     return [f"recipe={' and '.join(recipes)}"] if recipes else []
@@ -209,7 +209,7 @@ RowsAndNotes = tuple[list[Row], list[str]]
 
 
 def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
-    """Return a row per object and method, with the paper's measures and stricter measures.
+    """Return a row per object and method: pass rates, AUC, rotation error and paper's values.
 
     The baseline of Δ is the first method with a result, or the first refined method for refined
     poses. The reference rows come last.
@@ -374,7 +374,7 @@ def _change(points: pd.Series[float]) -> str:
 
 
 def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
-    """Return a row per network with its parameters and operations."""
+    """Return a row per network: parameters, multiply-accumulates (10⁹) and the paper's value."""
 
     def row(label: str, cost: Mapping[str, Any]) -> Row:
         return {

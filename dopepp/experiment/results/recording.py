@@ -67,8 +67,8 @@ def measure_and_record(
     Args:
         estimators: Estimators by name, the baseline first.
         parts: Objects to score, as defined by the test data.
-        data: Test data.
-        run_dir: Run folder.
+        data: Config of the test data.
+        run_dir: Folder for the results.
         num_pictures: Number of test images to draw.
         details: Further JSON values for ``metrics.json``, by key.
         results: BOP challenge CSVs of other methods, by name.
@@ -256,7 +256,7 @@ def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
 def _show_rejections(
     methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: SampleSource
 ) -> None:
-    """Print how many images, of the indices ``silent``, have no detection, and the reasons."""
+    """Print, by estimator, the number of images without a detection (``silent``), and why."""
     for name, numbers in silent.items():
         method = methods[name]
         if numbers and isinstance(method, EstimatorMethod) and method.estimator.has_network:

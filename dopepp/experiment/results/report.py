@@ -93,7 +93,7 @@ class Report:
 
     @property
     def matching_radii(self) -> dict[str, float]:
-        """Matching radius of every object with instances, metres."""
+        """Largest distance between matching centres (matching radius) by object, metres."""
         radii = {name: row.matching_radius for name, row in self.rows.items() if name != MEAN}
         return {name: radius for name, radius in radii.items() if radius is not None}
 
@@ -161,7 +161,6 @@ class Report:
 
 
 def _rows(record: Mapping[str, Mapping[str, Any]]) -> dict[str, PoseRow]:
-    """Restore table rows by object from JSON values."""
     return {name: PoseRow(**row) for name, row in record.items()}
 
 
@@ -212,7 +211,6 @@ class Fingerprint:
         return self._hash.hexdigest()
 
     def _add(self, facts: object) -> None:
-        """Add JSON values to the hash."""
         self._hash.update(json.dumps(facts).encode() + b"\n")
 
 

@@ -51,7 +51,7 @@ def tune_and_record(
     run_dir: Path,
     target: FalsePositiveTarget,
 ) -> Path:
-    """Tune the recovery options of a checkpoint and write it beside ``path``; return its path."""
+    """Tune score, thresholds and factors of the checkpoint at ``path``; return the new path."""
     if target.false_positive_rate == 1:
         fix = "set e.g. 0.005 to suppress detections on images without the part"
         _log.warning("false_positive_rate=1: every candidate is reported; %s", fix)
@@ -63,7 +63,7 @@ def tune_and_record(
 
 
 def _show(tuning: Tuning, path: Path) -> None:
-    """Print the effect of tuning on test images, the options and the tuned checkpoint's path."""
+    """Print the effect of tuning on test images, the tuned options and the new path."""
     shown, empty = tuning.num_images
     title = f"tuned; measured on {shown} test images and {empty} without objects"
     table = Table("", "network before", "after", title=title)

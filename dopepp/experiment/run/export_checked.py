@@ -63,7 +63,8 @@ def export(
 
     Raises:
         UserError: The checkpoint, an option or the path is invalid, or a package is not installed.
-        RunError: The export disagrees with the checkpoint, and nothing was written.
+        RunError: An fp32 export differs by more than rounding, another export has non-finite maps,
+            or the file cannot be written. Nothing was written.
     """
     target = _output_path(path, layout, precision, out)
     if runtimes.is_export(path):
@@ -144,7 +145,7 @@ def _network_inputs(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
 def _accuracy(
     original: PoseEstimator, exported: PoseEstimator, source: SampleSource, count: int
 ) -> dict[str, float]:
-    """Return ADD-0.1d of the checkpoint (``fp32``) and its export on the first ``count`` scenes."""
+    """Return ADD-0.1d of checkpoint (``fp32``) and export (``int8``) on ``count`` scenes."""
     _log.info("measuring both on %d other validation scenes", count)
     estimators = {"fp32": original, "int8": exported}
     methods = {

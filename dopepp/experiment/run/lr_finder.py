@@ -164,7 +164,7 @@ def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
 
 
 def smooth(values: Steps) -> Steps:
-    """Return a Gaussian moving average of width :data:`_SMOOTHING`, normalised at the ends."""
+    """Return a Gaussian moving average (σ: 5 % of the length), normalised at the ends."""
     position = np.arange(len(values))
     width = max(1.0, _SMOOTHING * len(values))
     weight = np.exp(-0.5 * ((position[:, None] - position) / width) ** 2)

@@ -199,7 +199,7 @@ def remember_overrides(run: Path) -> None:
 
 
 def _task(hydra: object) -> object:
-    """Return the overrides of the task in Hydra's stored config, or None."""
+    """Return the overrides in Hydra's stored config, except those of Hydra itself, or None."""
     for key in ("hydra", "overrides", "task"):
         hydra = hydra.get(key) if isinstance(hydra, dict) else None
     return hydra

@@ -190,7 +190,7 @@ def _train(
 
 
 def _progress(config: RunConfig, datamodule: PoseDataModule) -> list[Callback]:
-    """Return the callback that measures refined poses during training, if ``region`` refines."""
+    """Return the callback that measures refined poses in training, if ``refine`` has ``region``."""
     if "region" in (terms := refine_terms(config.refine)):
         return [RefinedProgress(datamodule.val_images, terms, config.stop_at)]
     if config.stop_at is not None:

@@ -192,7 +192,7 @@ def _chosen_factors(
     rate: float,
     old: RecoveryOptions,
 ) -> tuple[RecoveryOptions, ScoredDetections, str]:
-    """Fit the factors of network poses; keep the old factors if the fit lowers AP by over ``SAME``.
+    """Fit distance and covariance factor; keep the old ones if they raise AP by over ``SAME``.
 
     AP is measured on the estimator's final poses, because a wrong covariance of the network's poses
     misleads the refinement. The score of network poses is fitted for both.

@@ -175,7 +175,7 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
         folder: Folder of SLURM's logs.
         cluster: ``slurm``, or ``local`` for processes of this machine.
         max_num_timeout: Maximum number of times that a job is requeued at its time limit.
-        sbatch: Options by submitit's names; None uses the default of the cluster.
+        sbatch: Options of sbatch by submitit's names; None uses the default of the cluster.
     """
     require("submitit", "hydra/launcher=submitit_slurm", "slurm")
     given = {key: value for key, value in sbatch.items() if value is not None}

@@ -178,7 +178,7 @@ def requeue() -> str:
 
 
 def record_run(command: Sequence[str], run_dir: Path) -> None:
-    """Store the run folder of this SLURM job and command; do nothing outside SLURM."""
+    """Store the path of the run folder for this SLURM job and command, if inside SLURM."""
     note = _note(command)
     if note is not None:
         write_file(note, f"{run_dir.absolute()}\n".encode())

@@ -121,7 +121,7 @@ class _Trials:
             )
 
     def run(self, num_trials: int, at_a_time: int) -> list[JobReturn]:
-        """Run the unfinished trials of an earlier command, then new ones up to ``num_trials``."""
+        """Run an earlier command's unfinished trials, then new trials up to ``num_trials``."""
         returns: list[JobReturn] = []
         self._tell(self._running())
         left = self._running()
@@ -138,7 +138,7 @@ class _Trials:
         return returns
 
     def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
-        """Run trials of consecutive numbers and report their outcomes; no outcome is a failure."""
+        """Run trials of consecutive numbers; a trial without an outcome is reported as failed."""
         jobs = [overrides(self._space, trial.params) for trial in trials]
         returns = self._launcher.launch(jobs, initial_job_idx=trials[0].number)
         self._tell(trials)
@@ -234,7 +234,7 @@ def _distribution(sweep: Override) -> distributions.BaseDistribution:
 
 
 def _bad_entry(problem: str) -> UserError:
-    """Return the error for an entry of the search space."""
+    """Return the error for a wrong entry of the search space, which ``problem`` describes."""
     return UserError(
         f"search.space with {problem}",
         "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",
