@@ -61,7 +61,7 @@ class Writer(Protocol):
         """Write the files that all items share, idempotently; reject a folder of other data."""
 
     def write(self, index: int, sample: Sample) -> None:
-        """Write an item completely; after the call it survives a crash."""
+        """Write an item completely; no crash after the call can damage it."""
 
     def written(self, chunk: int) -> set[int]:
         """Return the indices of the chunk's complete items, finalized or not."""
@@ -138,12 +138,12 @@ def encode_by_key(content: Mapping[str, object]) -> bytes:
 
 
 def stage_item(path: Path, content: bytes) -> None:
-    """Write an item to a file in the staging folder, even if other processes remove the folder."""
+    """Write an item to a file in a staging folder that other processes may remove meanwhile."""
     _retry(lambda: write_file(path, content))
 
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
-    """Return the staged files in order, named by a number; none if the folder is missing."""
+    """Return the staged files ``NUMBER*SUFFIX`` in order; none if the folder is missing."""
     try:
         return sorted(staging.glob(f"[0-9]*{suffix}"))
     except FileNotFoundError:
@@ -152,7 +152,7 @@ def staged_items(staging: Path, suffix: str) -> list[Path]:
 
 @contextmanager
 def lock_staging(staging: Path) -> Iterator[None]:
-    """Lock a folder of staged items, and finally remove the folder if it is empty.
+    """Lock a folder of staged items, and remove the folder on exit if it is empty.
 
     Without the lock, a process could remove items that another process has just staged. The system
     releases the lock of a killed process.
@@ -181,7 +181,7 @@ def _open(path: Path) -> int:
 
 
 def _retry(act: Callable[[], T]) -> T:
-    """Repeat ``act`` until its folder exists; another process may remove the folder meanwhile."""
+    """Repeat ``act``, at most 100 times, if another process removes its folder during the call."""
     # A folder removed before its use is not found; a folder removed within ``mkdir`` "exists".
     for _ in range(_ATTEMPTS - 1):
         with suppress(FileNotFoundError, FileExistsError):

@@ -30,7 +30,7 @@ PIXEL_ASPECT: Final = (0.5, 2.0)
 
 
 class Box(NamedTuple):
-    """Axis-aligned box in an image; its ends are coordinates of pixel centres in the box."""
+    """Axis-aligned box in an image, pixels; pixels whose centres lie on its sides are inside."""
 
     left: float
     top: float
@@ -68,7 +68,10 @@ class Box(NamedTuple):
 
 
 def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
-    """Return why a matrix R is not a rotation (R·Rᵀ, determinant); None for a rotation and NaN."""
+    """Return why a matrix R is not a rotation, or None.
+
+    Entries of R·Rᵀ may differ from the identity by ``tolerance``. A matrix with NaN gives None.
+    """
     if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -80,7 +83,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
     """Report a position behind the camera (field ``z``) or an implausible distance (``unit``).
 
     Args:
-        node: Parent of the two fields.
+        node: Parent node of the two fields.
         translation: Camera frame, in the unit of ``diameter``.
         diameter: The object's diameter; None if unknown.
 
@@ -107,7 +110,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
 def plausible_camera(
     node: Node, K: CameraMatrix | None, shape: Shape | None
 ) -> CameraMatrix | None:
-    """Return K (pixels); None if K is missing, not finite or (reported) wrong for the image."""
+    """Return K (pixels); None if K is missing, not finite or, which is reported, implausible."""
     if K is None or not np.isfinite(K).all():
         return None
     if shape is None:
@@ -132,7 +135,7 @@ def check_box(
     visible_fraction: float | None = None,
     shape: Shape | None = None,
 ) -> None:
-    """Report visible pixels that contradict the object's pose.
+    """Report visible pixels outside the reprojected box, or too few for a fully visible object.
 
     Args:
         node: The box's field.

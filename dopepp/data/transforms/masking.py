@@ -93,7 +93,7 @@ class BackgroundCrops:
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
     def _is_free(self, size: Size) -> Bool[np.ndarray, "rows columns"]:
-        """Return for each window of ``size``, by its top left corner, if it shows no object."""
+        """Return whether a window of ``size`` shows no object, for each top left corner."""
         return np.asarray(_windows(self._integral, size) == 0)
 
     @cached_property

@@ -40,7 +40,7 @@ _NEVER: Final = np.iinfo(np.int32).max
 
 @dataclass(frozen=True)
 class ShadedSample:
-    """An image with shaded objects.
+    """An image whose objects are partly covered by patches of background.
 
     Attributes:
         share: Share of each instance's visible pixels to cover, in [0, 1].

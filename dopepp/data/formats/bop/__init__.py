@@ -204,7 +204,7 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
 
 
 def _by_image(node: Node) -> dict[int, Any]:
-    """Read a file whose keys are image numbers; report keys that are invalid or repeated."""
+    """Read a JSON file whose keys are image numbers; report other keys and repeated numbers."""
     allowed = 'images by number: {"0": …, "1": …}'
     by_image: dict[int, Any] = {}
     for key, record in (node.load(allowed, MAX_SCENE_BYTES) or {}).items():

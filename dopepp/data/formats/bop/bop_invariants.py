@@ -68,7 +68,7 @@ def scene_folders(root: Path) -> Iterator[Path]:
 
 
 def _is_scene(folder: Path) -> bool:
-    """Return whether a folder has a scene's JSON file, or a number as name and a folder ``rgb``."""
+    """Return whether a folder has a scene's JSON file, or a numeric name and a folder ``rgb``."""
     named = folder.name.isdecimal() and (folder / "rgb").is_dir()
     return named or any((folder / name).is_file() for name in (_CAMERA, _TRUTH, _INFO))
 
@@ -94,7 +94,7 @@ class _SceneCheck:
         self._has_truth = (folder / _TRUTH).is_file()
 
     def _image_files(self, kind: tuple[tuple[str, ...], tuple[str, ...]]) -> dict[int, Path]:
-        """Return colour or depth images by number; report images without a number as name."""
+        """Return colour or depth images by number; report images without a numeric name."""
         files = bop.image_files(self._folder, kind, self._report)
         for folder in {path.parent for path in files.values()}:
             for path in sorted(folder.glob("[!.]*")):
@@ -162,7 +162,7 @@ class _SceneCheck:
 
 
 def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
-    """Return the masks in a folder by image and object."""
+    """Return the paths of the masks in a folder by image number and object index."""
     files: dict[int, dict[int, Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         image, _, number = path.stem.partition("_")
@@ -341,7 +341,7 @@ def _check_counts(
 
 
 def _check_boxes(node: Node, info: Mapping[str, Any], mask_box: Box | None) -> Box | None:
-    """Report a ``bbox_visib`` off the mask's box; return the mask's box, or else ``bbox_visib``."""
+    """Report a ``bbox_visib`` unlike the mask's box; return the mask's box, or else the other."""
     boxes: dict[str, Box] = {}
     for field_name in ("bbox_visib", "bbox_obj"):
         if field_name in info:

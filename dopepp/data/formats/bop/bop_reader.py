@@ -50,11 +50,11 @@ class _Target:
 
 
 Targets = dict[tuple[int, int], Counter[int] | None]
-"""Counts of instances to find by object number, by (scene, image); None for all objects."""
+"""By (scene, image), the numbers of instances to find by object number; None for all objects."""
 
 
 def read_targets(path: Path) -> Targets:
-    """Return the targets of a file like ``test_targets_bop19.json``.
+    """Return the instances to find that a file like ``test_targets_bop19.json`` lists.
 
     Raises:
         UserError: The file holds no list of targets with ``scene_id`` and ``im_id``.
@@ -75,7 +75,7 @@ def read_targets(path: Path) -> Targets:
 class BopReader:
     """Reader of the images of a split, ordered by scene and image number.
 
-    The constructor reads the scenes' JSON files and checks every record; images are read singly. An
+    The constructor reads the scenes' JSON files and checks every record, but no image. An
     image without ground truth has no instances. The reader ignores and counts objects that are not
     among the parts or lie behind the camera (rendered sets have some). The visible fraction
     is ``visib_fract`` of ``scene_gt_info.json``, or an estimate of
@@ -115,7 +115,7 @@ class BopReader:
         self._log_deviations(with_model)
 
     def _find_items(self) -> list[tuple[BopScene, int]]:
-        """Return the scene and row in it of each selected image on disk, in order."""
+        """Return the scene, and the row in the scene, of each selected image on disk, in order."""
         listed = [
             (scene, row)
             for scene in self._scenes

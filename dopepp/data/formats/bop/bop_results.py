@@ -129,7 +129,6 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
-    """Return the 17 numbers of a line."""
     fields = [field.strip() for field in text.split(",")]
     if len(fields) != len(FIELDS):
         raise _error(f"{where} with {len(fields)} fields", f"7: {','.join(FIELDS)}")

@@ -199,7 +199,7 @@ class NddsSettings:
         """Return a class's ``fixed_model_transform`` as a rigid 4×4 matrix for column vectors.
 
         The matrix maps the mesh into the object frame; its translation is in the file's unit. The
-        file stores the transpose of this matrix. Its rotation is multiplied by the ratio of the
+        file stores the transpose of this matrix, with a rotation multiplied by the ratio of the
         units of mesh and file, e.g. 100 for metres and centimetres.
 
         Returns:
@@ -215,7 +215,7 @@ class NddsSettings:
         return None
 
     def dimensions(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
-        """Return a class's ``cuboid_dimensions`` (x, y, z) in the file's unit; None if unusable."""
+        """Return a class's ``cuboid_dimensions`` (x, y, z; file's unit); None if negative or 0."""
         for sides in self._arrays(annotation, label, "cuboid_dimensions", 3):
             if np.isfinite(sides).all() and (sides >= 0).all() and sides.any():
                 return sides
@@ -239,7 +239,7 @@ class NddsSettings:
     def _arrays(
         self, annotation: Path, label: str, name: str, *shape: int
     ) -> Iterator[NDArray[np.float64]]:
-        """Yield a field of each of a class's entries in which its numbers have the shape."""
+        """Yield field ``name`` of a class's entries as arrays; skip fields of another shape."""
         for entry in self._objects(annotation, label):
             with suppress(KeyError, TypeError, ValueError, OverflowError):
                 yield np.array(entry[name], np.float64).reshape(shape)
@@ -286,7 +286,7 @@ def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
 def label_values(
     objects: Objects, record: Mapping[str, Any], annotation: Path, settings: NddsSettings
 ) -> dict[str, int | None]:
-    """Return the value of each object's pixels in ``STEM.seg.png``, by the field of the object.
+    """Return the value of each object's pixels in ``STEM.seg.png``, by the object's ``Node.where``.
 
     The value is None if it is unknown or belongs to several objects. An object without
     ``segmentation_id`` has its class's value, unless the annotation states that values are ids.

@@ -123,7 +123,7 @@ class Observation:
 
     @cached_property
     def _corners(self) -> dict[Frame, NDArray[np.float64]]:
-        """The part's corners by convention of the frame: mesh frame, the file's order, metres."""
+        """The part's corners in the file's order, by kind of object frame; mesh frame, metres."""
         part_corners, front = self.part.cuboid[:8], _rotated_corners(self.part, _FRONT_X)
         rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
         fixed = _rotated_corners(self.part, rotation)
@@ -190,7 +190,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
 
     Raises:
         UserError: No convention fits three quarters of the instances within 5 px, or two
-            conventions with different poses fit equally well.
+            conventions with different poses fit almost equally well.
     """
     errors = {
         convention: _quantile([observation.error_px(convention) for observation in observations])
@@ -239,7 +239,7 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
 
 
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
-    """Return whether two conventions give three quarters of the instances nearly the same pose."""
+    """Return whether two conventions' poses agree, up to ``_SAME_POSE``, on most instances."""
     distances = []
     for observation in observations:
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part

@@ -107,7 +107,7 @@ class NddsReader:
         return conventions.find_convention(visible or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
-        """Return the part of a class name in the files, or None; see the class for the rules."""
+        """Return the part of a class name in the files (see the reader's ``parts``), or None."""
         label = self._classes.get(label, label)
         if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
             label = label[: -len(_FAT_SUFFIX)]
@@ -188,7 +188,7 @@ class NddsReader:
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Return one entry: hashes, pose convention and, for up to 1,000 items, instances."""
+        """Return one entry: hashes, convention and, for up to 1,000 items, numbers of instances."""
         identity: dict[str, object] = {
             "items": hashlib.sha256("\n".join(map(self._key, self.items)).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},

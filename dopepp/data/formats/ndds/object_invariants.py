@@ -42,7 +42,7 @@ NORM_TOLERANCE: Final = 0.01
 """Allowed deviations of ``pose_transform`` from a rotation and of a quaternion's norm from 1."""
 
 EDGE_SHARE: Final = 0.02
-"""Allowed inequality and slant of edges, of the longest; a box with a shorter edge is flat."""
+"""Allowed inequality and slant of edges, as a share of the longest; a thinner box is flat."""
 
 SIZE_SHARE: Final = 0.05
 """Allowed difference of edges from the class's ``cuboid_dimensions``."""
@@ -225,7 +225,7 @@ class ObjectCheck:
                     self._node[name].report(message)
 
     def _check_bounding_box(self, visible_box: Box | None) -> None:
-        """Report a ``bounding_box`` that does not contain the box of the visible pixels."""
+        """Report a ``bounding_box`` that is inverted or does not contain the visible pixels."""
         entry = mapping(self._item.get("bounding_box"))
         if not entry:
             return

@@ -77,7 +77,7 @@ def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember])
 def _check_image(
     report: CheckReport, start: str, content: Content, models: ModelSizes | None
 ) -> BopPoses:
-    """Check the members of one key; return its poses."""
+    """Check the members of one image, whose paths begin with ``start``; return its poses."""
     names = {shards.field_of(name): name for name in reversed(content)}
     shape: Shape | None = None
     if name := names.get("image"):

@@ -83,7 +83,7 @@ class WebdatasetWriter(BopFolder):
                 self._staging(chunk).rmdir()
 
     def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:
-        """Write a shard again, with its earlier images and the staged images."""
+        """Write a shard of its earlier images, if any, and of the staged images."""
         # The webdataset library's TarWriter writes the same archive but imports torch.
         path = self._shard(chunk)
         partial = partial_path(path)
@@ -132,7 +132,6 @@ def _merge_images(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Cont
 
 
 def _archive(key: str, content: Content) -> bytes:
-    """Return the bytes of a tar file with the files of one image."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
         _add_image(archive, key, content)

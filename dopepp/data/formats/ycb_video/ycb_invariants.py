@@ -117,7 +117,7 @@ class _FrameCheck:
         K: CameraMatrix | None,
         visible_box: Box | None,
     ) -> None:
-        """Check the pose of the object with a class index in ``meta``, whose file is ``node``."""
+        """Check position and visible box of class ``index`` in ``meta``; ``node`` is its file."""
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
             allowed = f"1 … {len(self._classes)}, the lines of classes.txt"

@@ -125,7 +125,7 @@ class YcbVideoReader:
         return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
 
     def _start(self, frame: str) -> str:
-        """Return the beginning of the paths of a frame's files."""
+        """Return the common start of the paths of a frame's files, ``ROOT/data/0050/000003``."""
         return str(self.root / ycb_video.FOLDERS[self.subset] / frame)
 
     def _meta(self, frame: str) -> FrameMeta:
@@ -149,7 +149,7 @@ class YcbVideoReader:
         )
 
     def describe(self) -> list[SourceInfo]:
-        """Return one entry: frame and mesh hashes, and instances unless frames exceed 1,000."""
+        """Return one entry: hashes and, for at most 1,000 frames, the numbers of instances."""
         identity: dict[str, object] = {
             "frames": hashlib.sha256("\n".join(self.frames).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
