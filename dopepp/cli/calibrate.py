@@ -453,7 +453,7 @@ def _show_hand_eye(
 
 
 def _show_rig(calibration: Rig) -> None:
-    """Print rejected images, and reprojection error and pose uncertainty of each camera."""
+    """Print rejected images, and each camera's reprojection error and pose standard deviations."""
     from math import degrees, hypot
 
     for moment in calibration.outliers:

@@ -40,7 +40,7 @@ class Output(Protocol):
 
 
 class Outputs:
-    """Outputs that a ``with`` block closes; an ``OSError`` of theirs becomes a `RunError`."""
+    """Group of outputs for a ``with`` block, which closes them; an OSError becomes a RunError."""
 
     def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs

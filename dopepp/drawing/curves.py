@@ -33,9 +33,10 @@ _SMOOTHING: Final = 50
 def accuracy_curve(
     errors: Float[np.ndarray, "n"],
 ) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Return thresholds from 0 to 0.1 m and the share of ``errors`` (metres) strictly below each.
+    """Return thresholds from 0 to 0.1 m, and the share of pose errors strictly below each.
 
-    NaN and infinite errors are misses; without errors, all shares are 0.
+    ``errors`` (e.g. ADD of each instance) are in metres; NaN and infinite errors are misses.
+    Without errors, all shares are 0.
     """
     thresholds = np.linspace(0.0, MAX_THRESHOLD, _NUM_STEPS + 1)
     errors = np.asarray(errors, np.float64)
@@ -52,7 +53,7 @@ def accuracy_figure(
     """Draw accuracy-threshold curves of several methods, with their exact AUC in the legend.
 
     Args:
-        curves: Errors of the instances in metres by method; infinite for a miss.
+        curves: Pose error of each instance by method, metres; infinite for a miss.
         title: Title of the figure.
         colours: Matplotlib colours by method (default: matplotlib's cycle).
     """
@@ -73,10 +74,9 @@ def save_accuracy_curves(
     curves: Mapping[str, Float[np.ndarray, "n"]],
     title: str = "",
 ) -> Figure:
-    """Write accuracy-threshold curves to ``<path>.png`` and ``<path>.csv``; return the figure.
+    """Write the curves of :func:`accuracy_figure` to ``<path>.png`` and ``.csv``; return it.
 
-    The CSV has a column ``threshold_m`` and, for each method, a column with the share in [0, 1].
-    ``curves`` has the errors by method, metres.
+    The CSV has a column ``threshold_m`` and, for each method, the share of smaller errors, 0 to 1.
     """
     path = Path(path)
     columns = {"threshold_m": accuracy_curve(np.zeros(0))[0]}
@@ -92,7 +92,7 @@ def save_accuracy_curves(
 
 
 def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figure, Axes]:
-    """Return an empty figure with labelled axes."""
+    """Return a figure with labelled axes, a grid and no data."""
     figure = Figure(figsize=(6.4, 4.4), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     axes.set(xlabel=x_label, ylabel=y_label, title=title)
@@ -109,7 +109,7 @@ def figure_image(figure: Figure) -> RGBImage:
 
 
 def _area(errors: Float[np.ndarray, "n"]) -> float:
-    """Return the area under the accuracy curve of errors (metres) up to 0.1 m, in [0, 1].
+    """Return the area under the curve of :func:`accuracy_curve`, divided by 0.1 m, in [0, 1].
 
     ``metrics.auc`` belongs to a higher layer, which this module cannot import.
     """
@@ -121,7 +121,7 @@ def _area(errors: Float[np.ndarray, "n"]) -> float:
 
 @dataclass(frozen=True)
 class RateCurve:
-    """Rates in [0, 1] at ascending values ``x``, with confidence limits ``low`` and ``high``."""
+    """A rate in [0, 1], e.g. accuracy, at ascending ``x``; 95 % limits ``low`` and ``high``."""
 
     x: Float[np.ndarray, "points"]
     rate: Float[np.ndarray, "points"]
@@ -174,7 +174,10 @@ def rates_figure(
 
 
 def coverage_figure(curves: Mapping[str, RateCurve]) -> Figure:
-    """Draw the observed over the nominal coverage of pose covariances, in [0, 1], by method."""
+    """Draw the observed (``rate``) over the nominal coverage (``x``) of pose covariances.
+
+    Coverage is the share of true poses in the confidence region of a probability, 0 to 1.
+    """
     percent = {name: replace(curve, x=100 * curve.x) for name, curve in curves.items()}
     figure = rates_figure({"coverage of the covariances": percent}, "nominal (%)", columns=1)
     axes = figure.axes[0]
@@ -197,7 +200,7 @@ class PlotLine:
 def lines_figure(
     lines: Sequence[PlotLine], x_label: str, y_label: str, log_y: bool = False
 ) -> Figure:
-    """Draw the mean over each line's runs, within a band from the lowest to the highest run.
+    """Draw the smoothed mean of each line's runs, in a band from the lowest to the highest run.
 
     ``log_y`` selects a logarithmic y axis if all finite values are positive.
     """
@@ -223,7 +226,7 @@ def lines_figure(
 
 
 def moving_average(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return the moving average over 1/50 of the points; windows are shorter at the ends."""
+    """Return the moving average over windows of 1/50 of the points, which shrink at the ends."""
     width = max(1, len(values) // _SMOOTHING)
     if width == 1:
         return values

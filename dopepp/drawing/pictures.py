@@ -104,7 +104,8 @@ def whole_image(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Ima
     """Decode an image file's content with the file's bit depth and channels.
 
     Raises:
-        ValueError: The content has another format, is damaged, or exceeds :data:`MAX_PIXELS`.
+        ValueError: The format is none of ``formats``, the content is damaged, or the image exceeds
+            :data:`MAX_PIXELS`.
     """
     try:
         image = _open(content, formats)

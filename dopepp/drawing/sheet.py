@@ -125,7 +125,7 @@ def belief_tiles(
 def heat_picture(
     image: RGBImage, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
 ) -> RGBImage:
-    """Blend a belief map into the dimmed image, with 0.8 times the belief (0 to 1) as opacity.
+    """Blend the belief map ``channel`` (0 to 1) into the dimmed image, with opacity 0.8 × belief.
 
     The image has the scale of the network's input, ``stride`` pixels per cell of the map.
     """
@@ -172,11 +172,11 @@ def depth_panel(depth: DepthMap, shown: Mask) -> tuple[RGBImage, str]:
 
 
 def draw_axes(image: RGBImage, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
-    """Draw an object frame's axes in place, except axes that are not finite or end far outside.
+    """Draw an object frame's axes on the image, in place.
 
-    ``ends`` are the projections of the origin and of the tips of x, y and z, pixels.
+    ``ends`` are the projections of the origin and of the tips of x, y and z, pixels. An axis with
+    an end that is not finite or is beyond 10 times the image's longer side is not drawn.
     """
-    # A tip this far outside belongs to an object beside the camera.
     bound = 10 * max(image.shape)
     for tip, colour in zip(ends[1:], AXIS_COLOURS, strict=True):
         if (np.abs([ends[0], tip]) < bound).all():

@@ -156,7 +156,7 @@ def make_experiment(
 
 
 def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[str, object]:
-    """Return the settings, largest hand-eye errors and duration for the top of the report."""
+    """Return the settings, largest hand-eye errors and duration for the head of the report."""
     worst_shift_mm = max(record.hand_eye_mm for record in records)
     worst_turn_deg = max(record.hand_eye_deg for record in records)
     return {

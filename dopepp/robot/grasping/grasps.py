@@ -152,7 +152,7 @@ def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
 
 
 def _check_grasp(record: _GraspRecord, name: str, part: Part) -> Grasp:
-    """Return a record's grasp; reject a point off the part and directions that are not square."""
+    """Return a record's grasp; reject a point off the part, and directions not at a right angle."""
     point, closing, approach = map(np.array, (record.point, record.closing, record.approach))
     lower, upper = part.cuboid.min(axis=0) - 0.01, part.cuboid.max(axis=0) + 0.01
     if not ((point >= lower) & (point <= upper)).all():
@@ -276,7 +276,7 @@ def _hits(
 
 
 def _from_above(middle: Vector, closing: Vector, width: float, up: Vector) -> Iterator[Grasp]:
-    """Yield a grasp for each of :data:`TILTS`, the approach's tilt from the steepest direction."""
+    """Yield the grasps of an antipodal pair with an approach tilted by :data:`TILTS` from down."""
     down = -up + (up @ closing) * closing
     down /= np.linalg.norm(down)
     aside = np.cross(closing, down)

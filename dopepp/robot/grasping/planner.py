@@ -149,8 +149,8 @@ def align_with_bench(T_base_obj: Transform, hull: Hull, T_base_bench: Transform)
     """Rotate and move an estimated pose so that the part's lowest stable face lies on the bench.
 
     An image from above determines tilt and height poorly; the bench determines both well. If the
-    lowest point is over :data:`LOW` metres above or below the bench after the rotation, the part
-    leans on another object, and its pose is returned unchanged.
+    lowest point is more than 5 mm above or below the bench after the rotation, the part leans on
+    another object, and its pose is returned unchanged.
     """
     up = T_base_bench[:3, 2]
     normals = hull.rests[0] @ T_base_obj[:3, :3].T

@@ -156,7 +156,7 @@ def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
 
 
 def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
-    """Sample a point uniformly from a disc around the origin, metres."""
+    """Sample a point (x, y) uniformly from a disc around the origin."""
     distance, angle = radius * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     return float(distance * np.cos(angle)), float(distance * np.sin(angle))
 
