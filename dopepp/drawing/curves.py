@@ -74,7 +74,7 @@ def save_accuracy_curves(
     curves: Mapping[str, Float[np.ndarray, "n"]],
     title: str = "",
 ) -> Figure:
-    """Write the curves of :func:`accuracy_figure` to ``<path>.png`` and ``.csv``; return it.
+    """Write :func:`accuracy_figure`'s curves to ``<path>.png`` and ``.csv``; return the figure.
 
     The CSV has a column ``threshold_m`` and, for each method, the share of smaller errors, 0 to 1.
     """

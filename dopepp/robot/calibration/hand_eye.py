@@ -190,7 +190,7 @@ def refine(
 
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
-    """Return the rotation and translation from X⁻¹ M⁻¹ Y, the expected board pose, to B."""
+    """Return rotation (rad) and translation (m) from X⁻¹ M⁻¹ Y, the expected board pose, to B."""
     expected = invert_transform(X) @ invert_transforms(M) @ Y
     rotvec = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([rotvec, B[:, :3, 3] - expected[:, :3, 3]], axis=1)

@@ -37,7 +37,7 @@ CHECKS_PER_S: Final = 5.0  # frames of a video in which the board is searched, p
 
 
 class Views:
-    """Views of a board whose points differ by more than 4 % of the image's width on average.
+    """Collection of distinct views of a board: their points are shifted by 4 % of the image width.
 
     Of similar views, the view with the smallest shift from the previous frame is kept, so that
     sharp frames of a video replace frames with motion blur.
@@ -73,7 +73,7 @@ class Views:
 
 
 def _shift(first: BoardDetection, second: BoardDetection) -> float:
-    """Return the mean shift of the common points in pixels, or inf for less than 8 such points."""
+    """Return the mean shift of the common points in pixels, or inf for fewer than 8 points."""
     is_same = (first.points[:, None] == second.points[None]).all(axis=2)
     rows, columns = np.nonzero(is_same)
     if len(rows) < MIN_POINTS:

@@ -279,7 +279,7 @@ def assess(
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:
-    """Return the 3D standard deviations of a point (metres) and of the rotation (radians).
+    """Return the standard deviations, over all axes, of a point (metres) and a rotation (radians).
 
     Args:
         covariance: Covariance of the camera's pose, as in :class:`HandEye`.

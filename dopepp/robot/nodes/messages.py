@@ -196,7 +196,7 @@ def image_fields(image: RGBImage, header: Fields) -> Fields:
 
 
 def _hypothesis(detection: Detection) -> Fields:
-    """Return the fields of ``vision_msgs/ObjectHypothesisWithPose``; translation comes first."""
+    """Return ``vision_msgs/ObjectHypothesisWithPose`` fields, with ROS's order of covariances."""
     order = [3, 4, 5, 0, 1, 2]
     covariance = detection.covariance[np.ix_(order, order)]
     return {

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 
 class Stamp(NamedTuple):
-    """Time of an image as in ROS: seconds since 1970 and nanoseconds."""
+    """Time of an image as in ROS: whole seconds since 1970, plus nanoseconds."""
 
     sec: int
     nanosec: int
