@@ -164,7 +164,7 @@ class NddsFinding:
     Attributes:
         error_px: Upper quartile of the instances' errors (:meth:`Observation.error_px`).
         rival_px: This quartile under the best convention with different poses.
-        undecided: Other conventions that give equal poses on these instances.
+        undecided: Conventions of other units, axes or orders that give equal poses here.
     """
 
     convention: PoseConvention

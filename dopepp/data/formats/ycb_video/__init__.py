@@ -122,7 +122,7 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
 
 
 def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
-    """Read the required fields of a ``meta.mat``; report an unreadable file and return None."""
+    """Read the ``_FIELDS`` of a ``meta.mat``; report an unreadable file and return None."""
     try:
         size = path.stat().st_size
         content = path.read_bytes() if size <= _MAX_META_BYTES else None
