@@ -37,7 +37,7 @@ class Timing:
 
     first: float  # first frame after loading
     frame: Float[np.ndarray, "frames"]  # each later frame, from image to poses
-    steps: dict[str, Float[np.ndarray, "frames"]]  # share of each step of the frames
+    steps: dict[str, Float[np.ndarray, "frames"]]  # time of each step
     num_found: float  # mean number of poses per frame
 
 
@@ -58,7 +58,7 @@ def time_frames(estimator: PoseEstimator, images: CameraImages, num_frames: int)
 class ExportAgreement:
     """Largest differences of maps and poses between an exported network and the original."""
 
-    maps: float  # difference of a map value, relative to the largest value above 1
+    maps: float  # difference of a map value over the largest value (at least 1)
     position_mm: float
     rotation_deg: float
     num_poses: int  # best-scored poses that both networks detect

@@ -216,7 +216,7 @@ def _outputs(
 
 
 def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera:
-    """Return the camera that the page's inputs specify."""
+    """Return the camera of the page's inputs; ``kind`` is ``VIEW``, ``NUMBERS`` or ``FILE``."""
     view, fx, fy, cx, cy, file = inputs
     if kind == VIEW:
         check("field of view", view, float, Range(MIN_VIEW_DEG, MAX_VIEW_DEG, "degrees"))

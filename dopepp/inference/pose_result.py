@@ -81,7 +81,7 @@ COLUMNS_POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Geometry of a part for drawing."""
+    """Diameter and outline mesh of a part, for drawing."""
 
     diameter: float  # metres
     mesh: OutlineMesh | None  # None if the part has no mesh: only its cuboid is drawn
@@ -104,7 +104,7 @@ class PoseResult:
     speed: Mapping[str, float]  # milliseconds of each of STEPS
     name: str  # image file, or source
     number: int = 0  # index in the source, from 0
-    time: float | None = None  # seconds since a video's start, or since 1970; None of an image
+    time: float | None = None  # seconds since a video's start, or since 1970; None for an image
     identities: Sequence[int] | None = None  # tracked instances; None without a tracker
     shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)  # by part name
     weaker: Sequence[float] = ()  # scores of the candidates below min_score, best first

@@ -50,7 +50,7 @@ class Viewer:
     """A Rerun recording, shown in a window or written to a file.
 
     Args:
-        estimator: Estimator of the results; it computes the belief maps.
+        estimator: Estimator that computed the results, for the parts and belief maps.
         path: ``.rrd`` file; None opens a window.
 
     Raises:
@@ -197,7 +197,7 @@ class Viewer:
 
 
 def belief_images(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, RGBImage]:
-    """Return the strongest belief of each part's keypoints as a colour image; empty for templates.
+    """Return each part's belief, the maximum over keypoints, in colour; empty for templates.
 
     The network runs again, on the largest of its image sizes.
     """
@@ -228,7 +228,7 @@ def _is_listening(port: int) -> bool:
 def _blueprint(distance: float) -> Any:
     """Return the layout: a 3D view on the left; image, belief maps and summary on the right.
 
-    ``distance`` is that of the parts from the camera, metres.
+    ``distance`` is the depth of the parts in the camera frame, metres.
     """
     import rerun.blueprint as rrb
 

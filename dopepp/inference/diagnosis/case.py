@@ -67,12 +67,12 @@ class Case:
 
     @cached_property
     def reported(self) -> list[Detection]:
-        """Detections at the expected distances, best score first."""
+        """Detections in the range ``distances``, best score first."""
         return self._detections(self.distances)
 
     @property
     def expected(self) -> Detection | None:
-        """Best detection at the expected distances, or None."""
+        """Best detection in the range ``distances``, or None."""
         return self.reported[0] if self.reported else None
 
     @cached_property
@@ -89,7 +89,7 @@ class Case:
 
     @cached_property
     def outside_range(self) -> Detection | None:
-        """Best detection outside the expected distances; None if there is a detection inside."""
+        """Best detection outside the range ``distances``; None if a detection is inside."""
         ranges = [self.estimator.depth_range(part.name) for part in self.estimator.parts]
         depths = [limits for limits in ranges if limits is not None]
         if self.expected is not None or not depths:
@@ -108,7 +108,7 @@ class Case:
 
     @property
     def detection(self) -> Detection | None:
-        """Best detection at the expected distances, or else outside them."""
+        """Best detection in the range ``distances``, or else outside it."""
         return self.expected or self.outside_range
 
     @cached_property
@@ -132,7 +132,7 @@ class Case:
 
     @cached_property
     def box(self) -> Letterbox:
-        """Image size that shows the part closest to its trained size; for templates, full size."""
+        """Resizing that shows the part closest to its trained size; for templates, at full size."""
         if not self.estimator.has_network:
             return Letterbox.scaled(self.image.shape[1::-1], 1.0)
         boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)

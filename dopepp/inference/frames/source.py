@@ -22,7 +22,7 @@ class CameraFrame:
     image: RGBImage  # RGB, with the lens distortion of the camera
     name: str  # image file, or name of a source of many frames
     number: int  # index in the source, or the file's number if all file names are numbers (BOP)
-    time: float | None = None  # seconds since a video's start or since 1970; None of an image
+    time: float | None = None  # seconds since a video's start or since 1970; None for an image
 
 
 class FrameSource(ABC):

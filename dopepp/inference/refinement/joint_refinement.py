@@ -127,7 +127,7 @@ def _widened(H: PoseMatrix, g: Vector, covariance: PoseMatrix) -> NormalEquation
 
 @dataclass(frozen=True, eq=False)
 class JointRefinement:
-    """Result of refining a pose on several images."""
+    """Pose refined on several images, with its covariance and each view's agreement."""
 
     T_world_obj: Transform
     covariance: PoseMatrix  # rotation vector about the object's origin and shift, world axes

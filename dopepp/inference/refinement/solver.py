@@ -56,7 +56,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Pose and information at the end of a descent."""
+    """Pose and its information (inverse covariance) at the end of a descent."""
 
     T_cam_obj: Transform
     information: PoseMatrix  # inverse covariance, from the terms and the prior

@@ -62,7 +62,7 @@ class Export:
     format: str  # `onnx`, `openvino` or `safetensors`
     precision: str  # `fp32`, `fp16` (weights) or `int8`
     size_multiple: Annotated[int, Range(1, 1024)]  # divisor of image height and width
-    parameters: Count  # trained numbers of the network
+    parameters: Count  # number of trained parameters
     gmacs: Annotated[float, Range(0, 1e12)]  # 10⁹ multiply-accumulates per image of training size
     # Share of instances with ADD below a tenth of the diameter on validation scenes, by precision
     # (before and after quantisation)

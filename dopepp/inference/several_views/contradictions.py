@@ -114,7 +114,7 @@ def _support(detection: WorldDetection) -> list[int]:
 
 
 def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None:
-    """Return the conflict between two detections, preferably a mutual conflict, or None."""
+    """Return how two detections contradict each other (see the module), or None."""
     if first.object != second.object or separation(first.pose, second.pose) <= CONSISTENT:
         return None
     conflicts = []
@@ -129,7 +129,7 @@ def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None
 def _swapped(
     observations: Views, images: Sequence[PosedImage], associated: Associate
 ) -> tuple[int, int] | None:
-    """Return the two views whose swap associates the most observations; None if no swap helps."""
+    """Return the two views whose swapped camera poses associate most observations, or None."""
 
     def agreeing(order: Sequence[int]) -> int:
         views = [

@@ -219,7 +219,7 @@ class Fit:
 
     @property
     def score(self) -> float:
-        """Agreeing share minus the contradicting and uncovered shares; higher is better."""
+        """Share of visible points that agree, minus contradicting and uncovered shares."""
         return self.seen - (1.0 - self.inliers) - self.uncovered
 
     def doubt(self, before: Fit) -> str:

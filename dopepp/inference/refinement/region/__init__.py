@@ -266,7 +266,7 @@ def _search_far(
 
 
 def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> Transform:
-    """Return the pose after the coarse round, in which the prior is weaker.
+    """Return the pose after the coarse round; the prior's deviations are widened by ``WIDENED``.
 
     Args:
         coarse: The coarse round.
@@ -280,7 +280,7 @@ def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> 
 
 
 def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
-    """Drop each coarse round whose next round searches at least ``ENOUGH`` of the search distance.
+    """Drop each coarse round whose next round covers the share ``ENOUGH`` of the search distance.
 
     Args:
         rounds: Rounds of optimisation, from coarse to fine.

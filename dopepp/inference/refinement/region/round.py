@@ -240,7 +240,7 @@ class Round:
         return OutlineAgreement(share, float((agrees & (weights > INFORMATIVE)).mean()))
 
     def _gain(self, end: Solution, prior: Prior, information: PoseMatrix) -> float:
-        """Return the increase of the information's log determinant due to the outline.
+        """Return by how much the outline increases the log determinant of the pose's information.
 
         For a tracked part, whose pose is precise, the gain is relative to a weaker prior.
         """
