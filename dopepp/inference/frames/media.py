@@ -222,7 +222,7 @@ class Live(FrameSource):
 
 
 class _NewestFrame:
-    """Reads a capture in a thread and keeps the newest frame."""
+    """Reads a ``cv2.VideoCapture`` in a thread and keeps the newest frame."""
 
     def __init__(self, capture: Any, name: str, clock: Callable[[], float]) -> None:
         self._capture, self._name, self._clock = capture, name, clock
@@ -304,7 +304,7 @@ def _as_rgb(image: UInt8[np.ndarray, "height width *channels"]) -> RGBImage:
 
 
 def _plausible_rate(rate: float) -> float:
-    """Return a header's frames per second, or the usual rate outside (0, ``HIGHEST_RATE``]."""
+    """Return a header's frames per second, or ``USUAL_RATE`` outside (0, ``HIGHEST_RATE``]."""
     return rate if 0 < rate <= HIGHEST_RATE else USUAL_RATE
 
 
