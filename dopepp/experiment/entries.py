@@ -206,7 +206,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
         return result.details.get(OBJECTIVE) if isinstance(result, Report) else None
     except KeyboardInterrupt:
         if not multirun.is_remote(hydra):
-            # Hydra skips its hook, so the finished jobs are compared here.
+            # Hydra skips the callback CompareJobs, so the finished jobs are compared here.
             multirun.compare_jobs(Path(hydra.sweep.dir), config)
         raise
     except PrunedError as end:

@@ -140,7 +140,7 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
 
 
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
-    """Open the labelled images of a split in ``data.root``; ``seed`` determines random choices.
+    """Open the labelled images of a split in ``data.root``, with ``seed`` for random choices.
 
     Raises:
         UserError: ``data.format`` is unknown, or ``data.root`` has no images of the split.

@@ -338,7 +338,7 @@ def optimizer_factory(node: Mapping[str, Any]) -> OptimizerFactory:
 
 
 def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
-    """Return a function from optimiser and number of steps to the schedule, or None if constant."""
+    """Return a function from optimiser and number of steps to the scheduler; None for no target."""
     if node.get(TARGET) is None:
         return None
     parameters = inspect.signature(SCHEDULERS.resolve(node[TARGET])).parameters

@@ -50,7 +50,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
 
 
 def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
-    """Return photos that training does not use, of ``virtual.backgrounds`` or the package.
+    """Return held-out photos of ``virtual.backgrounds``; the package's if those are procedural.
 
     Raises:
         UserError: The folder of the backgrounds has too few photos to be divided.

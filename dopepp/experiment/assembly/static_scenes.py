@@ -53,7 +53,7 @@ class StaticScenes:
         return len(self._reader)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an image, further images of its scene (``others``) and all camera poses."""
+        """Read an image and further images of its scene (``others``), each with its camera pose."""
         first, *others = (
             replace(self._reader.sample(number), T_world_cam=self._T_world_cam[number])
             for number in [index, *self._further_views(index)]

@@ -108,7 +108,7 @@ class VirtualConfig:
         """Camera with its working distance; None if the preset's camera is used.
 
         Raises:
-            UserError: The camera or the working distance is missing or wrong.
+            UserError: Only one of camera and working distance is set, or a value is wrong.
         """
         if self.camera is None and self.working_distance is None:
             return None

@@ -278,7 +278,7 @@ def _parts(run: Run) -> tuple[str, ...]:
 
 
 class _Model:
-    """The network of a method for some parts, from its first run, or the reason for its absence."""
+    """The network of a method's first run on some parts, or the reason why it cannot be loaded."""
 
     def __init__(self, entry: Entry, parts: tuple[str, ...]) -> None:
         self.name, self.reason = entry.name, entry.failure
@@ -330,7 +330,7 @@ class _Model:
 
 
 def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
-    """Return one tile per image and method, and the reason if there are no tiles."""
+    """Draw a tile per image and method; return the tiles, and the reason if there are none."""
     reasons = [f"{model.name}: {model.reason}" for model in models]
     loaded = [model for model in models if model.estimator is not None]
     samples: list[Sample] = []

@@ -55,7 +55,7 @@ class Run:
     """A training, evaluation or cost measurement, as read from its run folder.
 
     Attributes:
-        overrides: Overrides of the run, without options of locations.
+        overrides: Overrides of the run, without options of Hydra, locations and devices.
         report: Result on the test set, or None.
         failure: Reason for a missing result; empty if no result was requested (``job=cost``).
         config: Resolved config; empty if the run has none.
@@ -78,7 +78,7 @@ class Run:
 
     @property
     def method_key(self) -> tuple[str, str, str] | None:
-        """Recipe, name and test set, which all seeds of a method share; None if unknown."""
+        """Recipe, name and test set, equal for all runs of a method; None if unknown."""
         if self.report is None or self.seed is None or not self.recipe:
             return None
         return self.recipe, self.report.name, self.report.test_set
@@ -188,7 +188,7 @@ def _model(config: Mapping[str, Any], run: Run) -> str:
 
 
 def _without_automatic_sizes(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's config with None for the sizes that were chosen automatically."""
+    """Return a run's config with None for an automatic input size or camera scale."""
     composed, result = _mapping(folder / _HYDRA / "config.yaml"), dict(config)
     for node, name in _CHOSEN_SIZES:
         is_automatic = (composed.get(node) or {}).get(name, name) is None
@@ -234,7 +234,7 @@ def _read_result(run: Run) -> None:
 
 
 def overrides_of(folder: Path) -> list[str]:
-    """Return a run's overrides, without options of Hydra and of locations."""
+    """Return a run's stored overrides, without options of Hydra, locations and devices."""
     listed = _yaml(folder / _HYDRA / "overrides.yaml")
     texts = [str(text).lstrip("+") for text in listed] if isinstance(listed, list) else []
     ignored = tuple(f"{name}=" for name in _ELSEWHERE)

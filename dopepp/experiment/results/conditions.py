@@ -103,7 +103,7 @@ class Condition:
     ratio: bool = False
 
     def heading(self, level: float) -> str:
-        """Return the column heading of a level."""
+        """Return the column heading of a level, such as ``40 %``."""
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
@@ -229,7 +229,7 @@ def record_condition(
 def _values(
     levels: Sequence[Level], fields: Sequence[str], rates: Sequence[PassRate]
 ) -> Iterator[Value]:
-    """Yield the measured values, ordered by method, object and level."""
+    """Yield facts, counts and ``fields`` of all levels, ordered by method, object and level."""
     rated = [rate.field for rate in rates]
     for method, rows in levels[0].rows.items():
         for name in shown_rows(rows):

@@ -94,7 +94,7 @@ class NetworkCost:
     frames_per_s: float
 
     def texts(self) -> dict[str, str]:
-        """Return texts for tables, by heading."""
+        """Return sizes, counts and times as texts for tables, by heading."""
         (width, height), (columns, rows) = self.picture_size, self.input_size
         return {
             "image": f"{width}×{height}",
@@ -111,7 +111,7 @@ class NetworkCost:
 
 
 class SimulatedMapsEstimator(PoseEstimator):
-    """Estimator that runs its network but recovers poses from given maps.
+    """Estimator that runs its network but recovers poses from the maps in ``answer``.
 
     Attributes:
         answer: Maps for the next prediction, on the device of the estimator.
@@ -233,7 +233,7 @@ def likely_maps(
 
 
 def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
-    """Draw frames per second over time as a PNG (paper Fig. 13).
+    """Draw frames per second over time, from :func:`time_frames`, as a PNG (paper Fig. 13).
 
     Each network has a solid curve (image to poses) and a dashed curve (network alone).
     """

@@ -53,7 +53,7 @@ Counted = Callable[[Report, str], Float[np.ndarray, "instances"]]
 
 
 def _passes(threshold: float) -> Counted:
-    """Score 1 for an instance whose ADD is below a threshold in metres, else 0."""
+    """Return a function that scores an instance 1 if its ADD is below ``threshold`` (m), else 0."""
     return lambda report, name: (report.errors[name] < threshold).astype(np.float64)
 
 
@@ -274,7 +274,7 @@ def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
 
 
 def noise_notes(table: pd.DataFrame) -> list[str]:
-    """Return sentences that list, by method and object, the differences within noise."""
+    """Return sentences with the measures, by method and object, whose Δ is not significant."""
     changes = table[table["num_differing"].notna()]
     several = changes["object"].nunique() > 1
     sentences = []

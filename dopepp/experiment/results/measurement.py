@@ -86,7 +86,7 @@ def reported_candidates(method: Method, candidates: Sequence[ScoredPose]) -> lis
 
 
 class EstimatorMethod:
-    """Estimator that runs on images at native size and is evaluated on its own objects."""
+    """Estimator that runs on images at native size; only objects that it detects are measured."""
 
     def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
         names = {part.name for part in estimator.parts}
@@ -131,7 +131,7 @@ class EstimatorMethod:
 
 
 class ViewsMethod(EstimatorMethod):
-    """Estimator that runs on all images of a static scene; poses refer to the first image."""
+    """Estimator that runs on several images of a static scene; poses in the first camera frame."""
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Run the estimator on all images and return the candidates of measured objects."""
@@ -204,7 +204,7 @@ class FileMethod:
         return Cost(ms_per_frame=_median_ms(seconds))
 
     def check_used(self) -> None:
-        """Log, after all images, how many poses were not measured.
+        """Log, after all images, how many poses are on other images or of other objects.
 
         Raises:
             UserError: No pose was on an image of the test set.

@@ -296,7 +296,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     for name, measure in product(everything["object"].unique(), measures):
         table = everything[everything[["object", "measure"]].eq([name, measure]).all(axis=1)]
         head = {_OBJECT: name, _MEASURE: heading(measure)}
-        firsts: dict[str, pd.DataFrame] = {}  # table of the first run per refinement method
+        firsts: dict[str, pd.DataFrame] = {}  # rates of the first method by kind of refinement
         for label, rows_of_label in table.groupby("method", sort=False):
             rates = 100 * rows_of_label.pivot(index="seed", columns="share", values="rate")
             rows.append({_METHOD: label, **head, **_by_share(rates, _mean)})
@@ -318,7 +318,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
 
 
 def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
-    """Return the rates of a method's runs by object, measure, share and seed.
+    """Return a table of a method's pass rates by object, measure, covered share and seed.
 
     The file of a run may contain other methods, and the same method with and without refinement.
     The mean over objects is added if each network was trained on one part.

@@ -54,7 +54,7 @@ def export(
 
     Args:
         path: The checkpoint.
-        layout: One of :data:`~dopepp.inference.export.EXPORTERS`.
+        layout: File format, one of :data:`~dopepp.inference.export.EXPORTERS`.
         precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
         out: Path of the export (default: next to the checkpoint, or the working directory for a
             released checkpoint).

@@ -65,7 +65,7 @@ class Suggestion:
 
 
 def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
-    """Train with a growing learning rate; print, write and return the suggestion.
+    """Train with a growing learning rate; print, write and return a suggested rate, if any.
 
     The sweep uses the chosen optimiser without schedule, validation and checkpoints.
 

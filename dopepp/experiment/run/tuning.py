@@ -94,7 +94,7 @@ Made = TypeVar("Made")
 class ScoredDetections:
     """Detections of an estimator on a set of images, compared with the ground truth."""
 
-    features: Float[np.ndarray, "n features"]  # features of the score
+    features: Float[np.ndarray, "n features"]  # FEATURES or REFINED_FEATURES of each detection
     scores: Float[np.ndarray, "n"]  # scores with the estimator's present options
     correct: Bool[np.ndarray, "n"]  # whether ADD(-S) is below a tenth of the diameter
     image: np.ndarray  # (n,) index of each detection's image
@@ -498,7 +498,7 @@ def _judge(
 
 
 def _quality(test: ScoredDetections, empty: ScoredDetections, threshold: float) -> DetectionQuality:
-    """Measure the detections on test images with and without (``empty``) the parts."""
+    """Measure calibration, recall and precision on ``test``, and false positives on ``empty``."""
     scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
     error = expected_calibration_error(scores, correct)
     loud = empty.best_scores(np.where(empty.scores >= threshold, 1.0, 0.0))

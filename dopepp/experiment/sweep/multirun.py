@@ -27,7 +27,7 @@ from dopepp.core.files import write_file
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment import program
 
-# Hydra creates its hooks before any job, even in a single run, so slow imports are in functions.
+# Hydra creates callbacks before any job, even in a single run, so slow imports are in functions.
 
 _log = logging.getLogger(__name__)
 

@@ -149,14 +149,14 @@ class _Trials:
         return returns
 
     def _tell(self, trials: Sequence[FrozenTrial]) -> None:
-        """Report the outcomes of ended trials to the study."""
+        """Report state and objective of those trials that have ended to the Optuna study."""
         for trial in trials:
             state, value = outcome(self._folder / str(trial.number))
             if state != TrialState.RUNNING:
                 self._study.tell(trial.number, value, state=state)
 
     def _running(self) -> list[FrozenTrial]:
-        """Return the study's trials that have not ended."""
+        """Return the study's trials in the state ``RUNNING``."""
         return self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
 
 
