@@ -32,7 +32,7 @@ CornerPeaks = Float[np.ndarray, "8 peaks 2"]
 Corners = Float[np.ndarray, "instances 8 2"]
 
 MIN_DEVIATION: Final = 0.05  # smallest standard deviation of a vector's direction, radians
-POSITION_PX: Final = 1.0  # position error that rotates the direction from peak to centroid
+POSITION_PX: Final = 1.0  # standard deviation of positions, which rotates directions to a centroid
 MIN_LENGTH: Final = 1e-3  # a shorter mean vector has no direction
 PREDICTION_PX: Final = 4.0  # deviation of a keypoint from its prediction: half a cell of stride 8
 CANDIDATES: Final = 3  # number of peaks per corner, by belief and direction, that form triples
@@ -42,10 +42,10 @@ PERSPECTIVE: Final = 0.1
 of five times the part's size, corners are up to 10 % nearer or farther than the centroid."""
 
 SIGMA_FLOOR_PX: Final = 1.0  # bounds the weight of a sharp peak against a blurred peak
-WIDENINGS: Final = (1.0, 2.0, 4.0)  # factors on the peaks' deviations, until most keypoints agree
+WIDENINGS: Final = (1.0, 2.0, 4.0)  # factors on the standard deviations of peaks, tried in turn
 ROUNDS: Final = 3  # maximum number of times that poses regroup the keypoints
 
-BORDER: Final = 1.0  # cells from the maps' border within which a keypoint may lie outside the maps
+BORDER: Final = 1.0  # distance from the maps' border, cells, at which a keypoint may lie outside
 BORDER_DEVIATION: Final = 0.75
 """RMS error of a peak at the border for trained networks, cells: half of the belief lies outside
 the maps, which shifts the peak inward."""
@@ -53,7 +53,7 @@ the maps, which shifts the peak inward."""
 DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])  # Opposite corners
 ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])
 """Weights with which the arms of the diagonals' first corners sum to 0."""
-RIVALS: Final = -2  # marks a corner whose best peak is the same for two instances
+RIVALS: Final = -2  # marks a corner for which two instances prefer the same peak
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def solve_instances(
     results = [solve_group(group, cuboid, K) for group in groups]
     for _ in range(ROUNDS):
         if all(result.inliers.all() for result in results):
-            break  # complete instances have nothing to gain from each other
+            break  # all keypoints agree, so regrouping cannot improve a pose
         expected = np.full((len(groups), NUM_CORNERS, 2), np.nan)
         for corners, result in zip(expected, results, strict=True):
             if result.T_cam_obj is not None:

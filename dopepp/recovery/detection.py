@@ -47,7 +47,7 @@ inaccurate meshes, so its covariances are too large on renders."""
 
 PASSING: Final = 0.1  # ADD over the diameter below which a pose is correct
 
-# Squared Mahalanobis distances in 6D that three quarters and a tenth exceed.
+# Squared Mahalanobis distances that 75 % and 10 % of 6D Gaussian errors exceed.
 _QUARTER: Final = 3.455
 _TENTH_BEYOND: Final = 10.645
 _WRONG_RANGE: Final = math.log(1e6)  # range of ln(squared distance) of wrong poses

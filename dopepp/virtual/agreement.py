@@ -25,10 +25,10 @@ FLOOR: Final = 2.0  # gradient of noise, grey levels per pixel
 
 
 def agreement(image: RGBImage, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
-    """Return the agreement of a part's outline and creases with an image, in [0, 1].
+    """Return how well an image's edges lie on a part's outline and creases, in [0, 1].
 
-    1 means that the strongest edge lies on the contour everywhere. A part that is not in front of
-    the camera, or has no contour within the image, has agreement 0.
+    It is the mean ratio of the gradient at a contour pixel to the largest along its normal. A part
+    that is not in front of the camera, or has no contour within the image, has agreement 0.
     """
     if transform(T_cam_obj, surface.hull)[:, 2].min() <= NEAR:
         return 0.0

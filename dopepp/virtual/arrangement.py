@@ -35,7 +35,7 @@ _REDRAWS: Final = 25
 
 
 class Composition:
-    """The accepted objects of one scene; ``negatives`` are parts that may be distractors."""
+    """Objects of one scene that satisfy a preset; ``negatives`` are parts to use as distractors."""
 
     def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
@@ -103,7 +103,7 @@ class Preview:
         self._needed: list[float] = []
 
     def add(self, item: SceneObject) -> bool:
-        """Add an object if every target then keeps its visible fraction; return whether added.
+        """Add an object if each target then keeps the smallest visible fraction; return whether.
 
         An object that reaches the camera or spans over four image sides is not added.
         """
@@ -141,10 +141,10 @@ class Preview:
 def arrange_floating(
     composition: Composition, targets: Sequence[Body], reference_body: Body
 ) -> float:
-    """Place targets and distractors, and return the targets' mean depth, metres.
+    """Add targets and distractors to a composition, and return the targets' mean depth, metres.
 
-    If the first target does not fit, no target is placed. Without targets, the depth is the sampled
-    depth of ``reference_body``.
+    If no pose of the first target is accepted, no target is added. Without targets, the depth is a
+    sampled depth of ``reference_body``.
     """
     for body in targets:
         material = composition.draw_material(body)

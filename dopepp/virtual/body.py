@@ -61,7 +61,7 @@ class Body:
         return convex_pieces(self.part)
 
     def stretched(self, scale: Vector) -> Body:
-        """Return a distractor stretched along the axes by positive factors."""
+        """Return a distractor stretched along the object's x, y and z by positive factors."""
         stretch = triple(scale)
         return Body(self.surface.scaled(np.array(stretch)), source=self, stretch=stretch)
 
@@ -95,7 +95,7 @@ class Hull:
     centre: Vector
 
     def scaled(self, scale: Vector) -> Hull:
-        """Return the hull stretched along its axes by positive factors."""
+        """Return the hull stretched along the object's x, y and z by positive factors."""
         # A linear map preserves the hull, its flat faces and the centre of mass.
         return replace(self, vertices=self.vertices * scale, centre=self.centre * scale)
 
@@ -228,7 +228,7 @@ class Distractors(Checked):
 
 @cache
 def distractor_shapes() -> tuple[Body, ...]:
-    """Return the distractor shapes, each centred, with a bounding sphere of radius 1."""
+    """Return the distractor shapes, each centred, with a bounding sphere of radius 1 m."""
     return tuple(Body(_unit_surface(solid)) for solid in _solids())
 
 
@@ -279,7 +279,7 @@ def _mesh_of(solid: Manifold) -> Mesh:
 
 @cache
 def bin_walls() -> Body:
-    """Return a bin without a floor: inner width, depth and height 1, origin on the ground."""
+    """Return a bin without a floor: inner width, depth and height 1 m, origin on the ground."""
     outer = CrossSection.square((1 + 2 * WALL,) * 2, center=True)
     solid = (outer - CrossSection.square((1.0, 1.0), center=True)).extrude(1.0)
     return Body(make_surface(_mesh_of(solid)))

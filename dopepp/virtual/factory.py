@@ -42,7 +42,7 @@ _FOLDERS: Final = ("virtual", "parts", "geometry")  # the code that decides pixe
 
 
 class Factory:
-    """Renders labelled images of parts; image (epoch, index) depends on nothing but the seed.
+    """Renders labelled images of parts; image (epoch, index) depends only on the arguments.
 
     A factory can be pickled and forked: it holds no generator, so any process renders the same
     bytes for the same (seed, epoch, index), in any order.

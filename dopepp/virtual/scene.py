@@ -142,8 +142,8 @@ class Scene:
     """Objects, lights, background and camera of one image.
 
     Attributes:
-        T_cam_world: Pose of the camera of :meth:`seen_from`; the world frame is the camera that the
-            preset has sampled.
+        T_cam_world: Transform to this camera from the world frame, which is the camera frame of the
+            sampled scene (see :meth:`seen_from`).
     """
 
     K: CameraMatrix

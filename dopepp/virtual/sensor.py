@@ -56,7 +56,7 @@ class Sensors(Checked):
     """Probabilities and ranges of the camera effects in :class:`Sensor`.
 
     Attributes:
-        exposure_probability: Probability of a wrong exposure.
+        exposure_probability: Probability of an exposure other than 0.
         exposure_ev: Exposure in stops; 1 doubles the light.
         blur_probability: Probability of defocus blur.
         blur_px: Standard deviation of the blur, pixels; scales with the preset's image size.
@@ -157,7 +157,7 @@ def compress(image: RGBImage, quality: int) -> RGBImage:
 
 
 def _exposure_curve(exposure_ev: float) -> UInt8[np.ndarray, "256"]:
-    """Return the sRGB codes after multiplying the light by 2^EV, clipped at white."""
+    """Return the sRGB code for each code 0–255 with its light times 2^EV, clipped at white."""
     light = np.clip(decode_srgb(np.arange(256) / 255) * 2.0**exposure_ev, 0.0, 1.0)
     return np.asarray(np.rint(255 * encode_srgb(light)), np.uint8)
 

@@ -122,7 +122,10 @@ class _TableScene:
             yield _RestingPose(make_transform(rotation, origin), footprint, cell, height, centre)
 
     def _draw_point(self) -> tuple[float, float] | None:
-        """Sample (x, y) on the table, metres: in the heap's circle, or at a random pixel."""
+        """Sample (x, y) on the table, metres: in the heap's circle, or at a random pixel.
+
+        Return None for a pixel that shows no point within three camera distances.
+        """
         rng = self.rng
         if self.table.heaped:
             # The root makes the points uniform over the circle's area.
@@ -130,7 +133,6 @@ class _TableScene:
             return radius * math.cos(angle), radius * math.sin(angle)
         pixel = np.array([*(rng.uniform(0, 1, 2) * self.composition.size - 0.5), 1.0])
         inverse_depth = float(self._inverse_depth @ pixel)
-        # Objects beyond three camera distances would be tiny.
         if inverse_depth < 1 / (3 * self.T_cam_table[2, 3]):
             return None
         point = np.linalg.solve(self.composition.K, pixel) / inverse_depth
@@ -180,7 +182,7 @@ class HeightMap:
     def footprint(
         self, surface: Surface, rotation: RotationMatrix, lowest: float
     ) -> Footprint | None:
-        """Return the footprint of a turned object, or None if it covers too many cells.
+        """Return the footprint of a rotated object, or None if it spans over 1024 cells.
 
         ``lowest`` is the height of the object's lowest point relative to its origin, metres.
         """

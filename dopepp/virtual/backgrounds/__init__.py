@@ -42,7 +42,7 @@ class Backgrounds(Protocol):
         """Return an RGB image that depends only on the arguments."""
 
     def identity(self) -> list[str]:
-        """Return the kind and a fingerprint of its files, for the records of renders."""
+        """Return the backgrounds' kind and a fingerprint of their files, for records of renders."""
 
 
 def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Backgrounds:

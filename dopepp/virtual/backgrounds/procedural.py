@@ -81,7 +81,7 @@ def _palette(rng: Generator) -> UInt8[np.ndarray, "256 1 3"]:
 
 
 def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
-    """Return smooth noise in [0, 1] with about ``cells`` cells along the image's width."""
+    """Return smooth noise in [0, 1] with ``cells`` lattice cells along the image's width."""
     rows = max(round(cells * height / width), 1)
     grid = rng.random((rows + 1, cells + 1), np.float32)
     if cells * 32 <= width:
@@ -95,7 +95,7 @@ def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
 
 
 def _clouds(rng: Generator, width: int, height: int) -> Field:
-    """Return noise summed over up to five octaves, whose weights fall by a random factor."""
+    """Return noise summed over up to five octaves; the weight falls by a random factor in each."""
     field = np.zeros((height, width), np.float32)
     total, cells, gain = 0.0, int(rng.integers(2, 8)), rng.uniform(0.4, 0.9)
     for octave in range(5):
@@ -200,7 +200,7 @@ def _scatter(rng: Generator, image: RGBImage, count: int) -> None:
 
 _PLAIN_SHARE: Final = 0.4  # share of pieces of one colour with a brightness gradient
 _PRINTED_SHARE: Final = 0.2  # share of pieces with dark and light cells, like markers
-_WIDTHS: Final = (0.04, 0.4)  # of a piece over the image's, log-uniform: most objects are small
+_WIDTHS: Final = (0.04, 0.4)  # a piece's width over the image's, log-uniform
 _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 
 

@@ -110,7 +110,7 @@ class Preset(Checked):
         return camera_matrix(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
     def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
-        """Return K and (width, height) of the rendered image or window.
+        """Sample K and (width, height), pixels, of the rendered image or window.
 
         A window is centred on a uniformly sampled point, then shifted into the image. A window
         larger than the image is centred on the image.
@@ -219,7 +219,7 @@ def _read_shipped(name: str) -> Any:
 
 
 def _merge(values: Any, changes: Any) -> Any:
-    """Return nested mappings with fields changed; a group of another kind replaces the group."""
+    """Return ``values`` with nested changes; a mapping of another ``kind`` is replaced whole."""
     if not isinstance(values, dict) or not isinstance(changes, dict):
         return changes
     if changes.get("kind", values.get("kind")) != values.get("kind"):

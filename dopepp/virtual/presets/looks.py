@@ -24,7 +24,7 @@ Pitch = Annotated[Pair, Span(1e-6, 0.1, "metres")]
 Slope = Annotated[Pair, Span(0.0, 2.0, "tangent")]
 Intensity = Annotated[Pair, Span(0.0, 10.0, "1 = white")]
 
-_GREY_CAST: Final = 0.05  # largest relative deviation of a channel: real greys are not quite grey
+_GREY_CAST: Final = 0.05  # largest relative deviation of a grey's channels from its brightness
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Materials(Checked):
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
-        saturation: Saturation of colours.
-        roughness: Roughness of dielectrics.
+        saturation: HSV saturation of colours.
+        roughness: GGX roughness of dielectrics.
         specular: Reflectance of dielectrics at normal incidence.
         texture_gain: Factor on the colours of coloured surfaces.
         texture_tint: Largest relative deviation of a colour channel from ``texture_gain``, for
@@ -46,7 +46,7 @@ class Materials(Checked):
         noise_pitch: Distance between the noise's lattice points over the object's radius.
         metal_share: Share of untextured surfaces that are bare metal.
         metal_albedo: Reflectance of metals at normal incidence.
-        metal_roughness: Roughness of metals.
+        metal_roughness: GGX roughness of metals.
         brushed_share: Share of metals with brush marks.
         brush_pitch: Mean distance of the marks on brushed metals, metres.
         brush_slope: Largest slope of a mark's flanks, the tangent of the normal's tilt.

@@ -36,7 +36,7 @@ FACING: Final = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class FreeTurning(Checked):
-    """Any rotation, uniform over SO(3)."""
+    """Any orientation in the camera frame, uniform over SO(3)."""
 
     kind: Literal["free"] = "free"
 
@@ -229,7 +229,7 @@ class FillPlacement(_Placement):
         """Return the object's origin in the camera frame, metres.
 
         Args:
-            rng: Random numbers.
+            rng: Random generator.
             K: Camera matrix, pixels.
             size: (width, height) of the image.
             rotated_hull: Corners of the part's convex hull, relative to its origin, camera axes.
@@ -303,7 +303,7 @@ Placement = Annotated[
 def _depth_that_fills(
     share: float, ray: Vector, K: CameraMatrix, size: Size, centred_hull: Points
 ) -> float:
-    """Return the depth, metres, at which a hull on a ray fills a share of the image's side."""
+    """Return the depth on ``ray``, metres, at which the hull's box fills a share of the image."""
     closest = float(-centred_hull[:, 2].min()) * (1 + 1e-6)
     rays, rows, columns = centred_hull @ K[:2].T, ray @ K[:2].T, np.array(size, np.float64)
     low, high = closest, np.inf

@@ -22,7 +22,7 @@ from dopepp.virtual.scene import Plane, triple
 
 @dataclass(frozen=True)
 class Pile(Checked):
-    """A heap of objects dropped by physics (extra ``robot``), which decides what is visible.
+    """Heaps of objects dropped by physics (extra ``robot``), without limits on their visibility.
 
     Attributes:
         piles: Number of different heaps in every 10,000 images; heaps are cached on disk.

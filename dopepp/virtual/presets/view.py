@@ -111,13 +111,13 @@ class View:
         return float(f"{min(scale, 1.0):.3g}")
 
     def window_for(self, parts: Sequence[Part], scale: float) -> Size:
-        """Return a square window, pixels, with room for the largest part, or the scaled image."""
+        """Return the size of a square window that holds the largest part, clipped to the image."""
         lengths = _ROOM * self.sizes_px(parts, scale)[1], *(scale * side for side in self.size)
         side, width, height = (_MULTIPLE * math.ceil(length / _MULTIPLE) for length in lengths)
         return min(side, width), min(side, height)
 
     def window(self, preset: Preset, scale: float, size: Size | None) -> Preset:
-        """Return a preset for windows (None: whole images) of this camera's scaled images."""
+        """Return a preset for this camera's scaled images in windows of ``size`` (None: whole)."""
         near, far = self.distance
         table = preset.table and replace(preset.table, distance=(near, far))
         return replace(

@@ -169,7 +169,7 @@ def _is_closed(merged: Faces, triangles: Corners) -> bool:
 def _corner_normals(
     merged: Faces, doubled: Float[np.ndarray, "faces 3"], length: PerFace, edges: Corners
 ) -> Corners:
-    """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
+    """Return angle-weighted corner normals (Thürmer and Wüthrich 1998), not averaged over creases.
 
     ``doubled`` is the cross product of two edges of every face, and ``length`` its length.
     """

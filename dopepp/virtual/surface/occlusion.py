@@ -105,7 +105,7 @@ def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
 def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
     """Return each triangle's steps, the index of its first point, and the number of all points.
 
-    The spacing is the smallest, from ``_FINEST`` on, at which the points are few enough.
+    The spacing grows from ``_FINEST`` until there are 3 points per triangle plus 40,000 at most.
     """
     longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
     spacing, most = _FINEST * size, 3 * len(corners) + 40_000

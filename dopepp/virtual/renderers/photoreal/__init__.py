@@ -128,7 +128,7 @@ def _chosen_library() -> Path | None:
 
 
 def candidates() -> list[Path]:
-    """Return the paths of installed libLLVM files, the newest version first."""
+    """Return the libLLVM files to try: ``DRJIT_LIBLLVM_PATH``, or all installed, newest first."""
     setting = os.environ.get(LIBRARY_SETTING)
     if setting:
         return [Path(setting)]
@@ -143,7 +143,7 @@ def candidates() -> list[Path]:
 
 
 def is_usable(library: Path) -> bool:
-    """Return whether Mitsuba renders with a libLLVM, from the cache or by a trial in a process."""
+    """Return whether Mitsuba renders with a libLLVM, from the cache or by a separate process."""
     try:
         stat = library.stat()
     except OSError:

@@ -227,7 +227,7 @@ class TableTop:
         return {"type": "disk", "to_world": to_world.scale(self.radius), "bsdf": bsdf}
 
     def unshadowed(self, area: Area) -> Colours:
-        """Return the disc's linear radiance without objects; 0 outside the disc."""
+        """Return the radiance of an image area without objects, linear RGB; 0 outside the disc."""
         return np.asarray(self.albedo * self._light[area])
 
     def fade(self, light_share: Colours, area: Area) -> Colours:

@@ -146,7 +146,7 @@ def _depths(item: SceneObject) -> tuple[float, float]:
 
 
 def _count_whole_px(item: SceneObject, projection: Projection, K: Array) -> float:
-    """Count the pixel centres of an unoccluded object on an unbounded canvas."""
+    """Count an unoccluded object's pixels on an unbounded canvas; inf if it is at the camera."""
     left, top, right, bottom = projection.extent
     if not math.isfinite(left):
         return math.inf  # the object reaches the camera
@@ -162,7 +162,7 @@ def _count_whole_px(item: SceneObject, projection: Projection, K: Array) -> floa
 def _composite(
     samples: Samples, colour: Array, first_ids: Array, image: Array, depth: Array, instances: Array
 ) -> None:
-    """Composite ``colour``, each pixel's sum of sRGB values, and write depth and instances."""
+    """Composite ``colour``, sums of sRGB samples, over ``image``; write depth and instances."""
     origin, inverse_depth, ids = samples
     height, width, num_samples = ids.shape
     centre = num_samples - 1

@@ -210,7 +210,7 @@ def _interpolate(
 def _corner_heights(
     vertices: Array, a: int, b: int, c: int, normals: Array
 ) -> tuple[float, float, float, float, float, float]:
-    """Return the distances of a triangle's corners below each other's tangent plane, metres."""
+    """Return the depths of the other two corners below each corner's tangent plane, metres."""
     # The depth of a point below each tangent plane is linear in these distances. The mean of the
     # three depths, weighted by the barycentric coordinates, is the depth below the smooth surface
     # (Hanika, "Hacking the shadow terminator", Ray Tracing Gems II, 2021).

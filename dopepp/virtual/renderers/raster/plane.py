@@ -1,7 +1,7 @@
 """Shadows of objects on the image of a supporting plane.
 
 The background shows the plane in full light and is multiplied by the share of light (sky and lamps)
-that objects leave. Homographies warp each shadow map and the grid of the sky into the image.
+that objects do not block. Homographies warp each shadow map and the sky's grid into the image.
 
 Points on the objects' surfaces hide the sky in 32 cosine-distributed directions. Each point sets
 one bit per direction in a cell of the plane. The share of bits is the hidden share of the sky and
@@ -117,8 +117,8 @@ def _soft_shadow(
     # The penumbra's width is the lamp's angular size, seen from the object, times the gap.
     gap = float(np.median(1 / ground[hit] - 1 / drawn[hit]))
     texel = shadow.texel * float(np.median(1 / ground[hit]))
-    # The plane sees the lamp 0.04 radians wide. The map's outlines are not anti-aliased: a blur of
-    # at least 0.7 texels makes them smooth.
+    # Seen from the plane, a lamp is 0.04 rad wide. The map's outlines are not anti-aliased: a blur
+    # of at least 0.7 texels makes them smooth.
     sigma = min(max(0.25 * 0.04 * gap / texel, 0.7), max(rows, columns) / 16)
     margin = math.ceil(3 * sigma)
     cast = cv2.copyMakeBorder(cast, *4 * (margin,), cv2.BORDER_CONSTANT, value=0.0)
@@ -291,7 +291,7 @@ def _is_full(ids: Array, j: int, i: int) -> bool:
 def _light_row(
     corner: tuple[int, int], j: int, lit: _LitPlane, shades: Array, total: Array, lost: Array
 ) -> None:
-    """Fill ``total`` with the unblocked light on row j of ``shades``, ``lost`` with the blocked."""
+    """Fill ``total`` with the light on row j without objects, ``lost`` with its blocked part."""
     to_point, normal, sky, lights, P = lit
     fv = np.float32(corner[1] + j)
     px, py = to_point[0, 1] * fv + to_point[0, 2], to_point[1, 1] * fv + to_point[1, 2]

@@ -275,7 +275,7 @@ def _project_points(
 
 @compiled(fastmath=True)
 def _compare(points: Array, inverse_depth: Array, lit: Array) -> None:
-    """Write the lit share, in [0, 1], of the points of :func:`_project_points`."""
+    """Write to ``lit`` the share of light that reaches the points of :func:`_project_points`."""
     for p in range(lit.shape[0]):
         u, v, inverse = points[0, p], points[1, p], points[2, p]
         lit[p] = open_share(u, v, inverse, inverse_depth) if inverse > _ZERO else _ZERO
