@@ -229,7 +229,7 @@ def record_condition(
 def _values(
     levels: Sequence[Level], fields: Sequence[str], rates: Sequence[PassRate]
 ) -> Iterator[Value]:
-    """Yield facts, counts and ``fields`` of all levels, ordered by method, object and level."""
+    """Yield ``Level.facts``, counts and ``fields``, ordered by method, object and level."""
     rated = [rate.field for rate in rates]
     for method, rows in levels[0].rows.items():
         for name in shown_rows(rows):

@@ -254,7 +254,7 @@ def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost
     The time is the median of three forward passes on the CPU after an untimed pass.
 
     Args:
-        spec: Spec of the network.
+        spec: Description of the network for :func:`~dopepp.models.network.build_network`.
         input_size: Input size (width, height), pixels; the paper uses 416×416.
     """
     widened = {

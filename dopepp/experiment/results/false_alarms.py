@@ -75,7 +75,7 @@ class UndistortedFrames:
         return len(self.frames)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return an image without instances, with its path as key."""
+        """Return an undistorted image without instances, with the path of its file as key."""
         sample = self.frames.sample(index, epoch)
         key = sample.key.rpartition("/")[0]
         return replace(sample, image=self.camera.undistorted(sample.image), key=key)

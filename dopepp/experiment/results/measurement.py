@@ -55,7 +55,7 @@ _NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
 
 
 class ScoredPose(PredictedPose, Protocol):
-    """Attributes of a detection that a measurement needs."""
+    """Predicted pose with the projection of its cuboid, which drawings need."""
 
     @property
     def keypoints(self) -> Float[np.ndarray, "9 2"]:

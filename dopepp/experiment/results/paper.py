@@ -159,7 +159,7 @@ class PaperTable:
 
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
-    """Print the table and write ``table.md``, ``table.csv`` and the figure of the kind, if any."""
+    """Print the table; write ``table.md``, ``table.csv`` and, for shading and time, a figure."""
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
     if table.kind not in _MEASURED:  # refinement does not affect the cost of a network
         entries = [entry for entry in entries if not entry.refine]
@@ -355,7 +355,7 @@ def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
 
 
 def _by_share(points: pd.DataFrame, text: Callable[[pd.Series[float]], str]) -> Row:
-    """Return, by heading of each covered share, the text for the numbers of all seeds."""
+    """Return, by heading of each covered share, the ``text`` of the numbers of all seeds."""
     return {SHADING.heading(share): text(column.dropna()) for share, column in points.items()}
 
 

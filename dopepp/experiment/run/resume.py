@@ -206,7 +206,7 @@ def _task(hydra: object) -> object:
 
 
 def _listed(differences: Sequence[ConfigDifference]) -> str:
-    """Join differences of options; without any, only the number of objects can differ."""
+    """Join differences of options into a text; without any, the number of objects differs."""
     return ", ".join(map(str, differences)) or "the number of objects"
 
 

@@ -111,7 +111,7 @@ class ScoredDetections:
         return np.array([kind == LOOKALIKES for kind in self.kinds], bool)
 
     def best_scores(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
-        """Return the highest of ``scores``, one per detection, in every image; 0 without any."""
+        """Return each image's highest score, from a score per detection; 0 without a detection."""
         best = np.zeros(self.num_images)
         np.maximum.at(best, self.image, scores)
         return best
@@ -243,7 +243,7 @@ def _measured(
 
 
 def _without_refinement(estimator: PoseEstimator) -> PoseEstimator:
-    """Return a copy of an estimator that reports network poses."""
+    """Return a copy of an estimator that does not refine the network's poses."""
     plain = copy.copy(estimator)
     plain.refiner = None
     return plain
