@@ -208,7 +208,7 @@ def _find(
 
 @compiled()
 def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> int:
-    """Write belief, column and row of maxima above ``threshold`` by belief; return their number."""
+    """Write belief, column, row of maxima above ``threshold``, highest first; return the count."""
     count = 0
     for y in range(belief.shape[0]):
         for x in range(belief.shape[1]):

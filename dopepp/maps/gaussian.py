@@ -285,7 +285,7 @@ def _linearised(
 
 @compiled()
 def _step(theta: Array, hessian: Array, workspace: Array) -> float:
-    """Add the Gauss–Newton step for gradient ``workspace[0]``; return its largest magnitude."""
+    """Add the Gauss–Newton step (gradient: ``workspace[0]``) to ``theta``; return its max norm."""
     solve_inside(hessian, workspace[0], 0.0, workspace[1], workspace[4:])
     farthest = 0.0
     for k in range(6):

@@ -217,7 +217,7 @@ def associate(
 
 
 def _border_covariance(position: Array, covariance: Array, extent: Array, stride: float) -> Array:
-    """Widen the covariances, pixels², of peaks within :data:`BORDER` cells of the maps' border."""
+    """Return covariances, pixels², with ``BORDER_DEVIATION``² added within ``BORDER`` cells."""
     inward = np.minimum(position + 0.5, extent - 0.5 - position).min(axis=-1)
     widened = covariance.copy()
     widened[inward < BORDER * stride] += (BORDER_DEVIATION * stride) ** 2 * np.eye(2)
@@ -226,7 +226,7 @@ def _border_covariance(position: Array, covariance: Array, extent: Array, stride
 
 @compiled()
 def _averaged(covariance: Array) -> Array:
-    """Return isotropic covariances: the mean variance plus the squared floor; NaN stays NaN."""
+    """Return isotropic covariances of the mean variance plus ``SIGMA_FLOOR_PX``²; NaN stays NaN."""
     averaged = np.zeros(covariance.shape)
     for k in range(len(covariance)):
         variance = (covariance[k, 0, 0] + covariance[k, 1, 1]) / 2 + SIGMA_FLOOR_PX**2
@@ -303,7 +303,7 @@ def _gain(
 
 @compiled()
 def _unrivalled(gain: Array) -> Array:
-    """Return each instance's peak of highest gain per corner; −1: none, RIVALS: a shared peak."""
+    """Return each instance's peak of highest gain per corner; −1: none, RIVALS: peak is shared."""
     chosen = np.full(gain.shape[:2], -1, np.int64)
     for k in range(gain.shape[1]):
         for i in range(len(gain)):
@@ -367,7 +367,7 @@ def _predict(
 def _best_triple(
     arms: Array, evidence: Array, usable: Array, area_px: float, expected: Array
 ) -> float:
-    """Predict an instance's corners from the corner peaks with the highest :func:`_agreement`.
+    """Predict an instance's corners from three peaks with the highest :func:`_agreement`.
 
     The ``usable[k]`` candidates of corner k have the vectors ``arms[k]`` from the centroid, pixels.
     ``expected`` is filled with the predicted vectors, and their standard deviation is returned.
@@ -410,7 +410,7 @@ def _best_triple(
 def _agreement(
     diagonals: Array, arms: Array, evidence: Array, usable: Array, area_px: float, least: float
 ) -> tuple[float, float]:
-    """Sum each corner's highest evidence of a candidate for the corners that diagonals predict.
+    """Sum over corners the highest evidence that a candidate is the corner that diagonals predict.
 
     ``diagonals`` has the vectors from the centroid to corners 0–3, pixels. The summation stops
     early, with an upper bound, once the sum cannot exceed ``least``.

@@ -317,7 +317,7 @@ def _odds(probability: float, certain: float = _CERTAIN) -> float:
 def score(
     features: Float[np.ndarray, "*n features"], weights: Float[np.ndarray, "features"]
 ) -> Float[np.ndarray, "*n"]:
-    """Return the probability in (0, 1) that a logistic model assigns to each detection's pose."""
+    """Return the probability, in (0, 1), that each pose is correct, by a logistic model."""
     return np.asarray(1 / (1 + np.exp(-np.clip(features @ weights, -30, 30))))
 
 

@@ -156,7 +156,7 @@ def explain(
     names: Sequence[str] | None = None,
     **options: float,
 ) -> list[Reason]:
-    """Return why each object or candidate was not detected; arguments as in :func:`recover`."""
+    """Return why objects and candidates (centroid peaks) are not detected; see :func:`recover`."""
     reasons: list[Reason] = []
     camera = np.asarray(K)[None]
     recover_batch(belief[None], field[None], cuboids, camera, stride, names, reasons, **options)

@@ -103,7 +103,7 @@ class Preview:
         self._needed: list[float] = []
 
     def add(self, item: SceneObject) -> bool:
-        """Add an object if each target then keeps the smallest visible fraction; return whether.
+        """Add an object, and return True, if each target then keeps the smallest visible fraction.
 
         An object that reaches the camera or spans over four image sides is not added.
         """

@@ -112,7 +112,7 @@ class Factory:
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
 
     def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
-        """Return the scene of an image without rendering it.
+        """Return the scene of an image without rendering it; arguments as in :meth:`render`.
 
         Raises:
             UserError: No target fits into a scene, or the camera is below the parts at this scale.

@@ -110,7 +110,7 @@ class Sensors(Checked):
 def capture(image: RGBImage, sensor: Sensor) -> RGBImage:
     """Apply a sensor's effects to an ideal image; the default sensor has none.
 
-    Exposure works on linear light; both blurs work on sRGB and spread highlights slightly less.
+    Exposure works on linear light; blurs work on sRGB and spread highlights less than a lens does.
     """
     if sensor.exposure_ev:
         image = np.asarray(cv2.LUT(image, _exposure_curve(sensor.exposure_ev)))

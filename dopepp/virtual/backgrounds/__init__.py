@@ -49,8 +49,8 @@ def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Ba
     """Return the backgrounds that a user selects.
 
     Args:
-        choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
-            installed scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
+        choice: None or ``procedural`` for textures, which need no files; ``skimage`` for the photos
+            in scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
         split: Split of the photos (:meth:`PhotoBackgrounds.part`).
 
     Raises:

@@ -75,7 +75,7 @@ class PhotoBackgrounds:
         return self.__dict__ | {"_photos": OrderedDict(), "_kept_bytes": 0}
 
     def identity(self) -> list[str]:
-        """Return the kind, and a hash of the photos' relative paths and sizes."""
+        """Return kind and split, number of photos, and a hash of their relative paths and sizes."""
         digest = hashlib.sha256()
         for path in self.paths:
             name = path.relative_to(self.folder).as_posix()
@@ -150,7 +150,7 @@ class PhotoBackgrounds:
             mirrored: Whether to flip left and right.
 
         Raises:
-            UserError: Too many photos are damaged.
+            UserError: More than 10 photos or more than 1 % of all photos are damaged.
         """
         photo = None
         while photo is None:
@@ -186,7 +186,7 @@ class PhotoBackgrounds:
         return sizes
 
     def _read(self, path: Path, longest: int | None = None) -> RGBImage | None:
-        """Return a photo, or log that it is damaged and return None; raise if too many are."""
+        """Return a photo with sides of at most ``longest`` pixels; None, logged, if damaged."""
         if path in self.bad:
             return None
         try:

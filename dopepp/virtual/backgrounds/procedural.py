@@ -237,7 +237,7 @@ class ClutteredBackgrounds:
         return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
     def _add_piece(self, rng: Generator, image: RGBImage) -> None:
-        """Paint a random piece of another image onto ``image``, clipped at its border."""
+        """Paint a plain, printed or background piece onto ``image``, clipped at its border."""
         rows, columns = image.shape[:2]
         size = columns * math.exp(rng.uniform(*np.log(_WIDTHS)))
         outline = _outline(rng) * size / 2

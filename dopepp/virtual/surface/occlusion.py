@@ -161,10 +161,10 @@ def _bake(
     grid: _Points,
     sums: Array,
 ) -> None:
-    """Sum the cosines of directions over each point's hemisphere, with a depth map per direction.
+    """Sum the cosines between each point's normal and directions, blocked by one depth map each.
 
-    ``centre`` and ``radius`` are a sphere around the mesh. The rows of ``sums`` are the unblocked
-    and all directions of the front, then of the back.
+    ``centre`` and ``radius`` are a sphere around the mesh. The rows of ``sums`` are over unblocked
+    and over all directions on the front side, then on the back side.
     """
     points, upright, ground, flat = grid
     side = _MAP_SIDE

@@ -73,7 +73,7 @@ def make_texture(image: RGBImage, uv: Float[np.ndarray, "vertices 2"], faces: Fa
 def _used_texels(
     uv: Float[np.ndarray, "vertices 2"], faces: Faces, shape: Shape
 ) -> Float[np.ndarray, "_ _"]:
-    """Return 1 at texels that a triangle touches, else 0."""
+    """Return 1 at texels that a triangle touches, else 0; all 1 if the texture repeats."""
     rows, columns = shape
     used = uv[faces]
     if used.min() < 0.0 or used.max() > 1.0:

@@ -143,7 +143,7 @@ def candidates() -> list[Path]:
 
 
 def is_usable(library: Path) -> bool:
-    """Return whether Mitsuba renders with a libLLVM, from the cache or by a separate process."""
+    """Return whether a trial process could render with a libLLVM; the outcome is cached."""
     try:
         stat = library.stat()
     except OSError:

@@ -209,7 +209,7 @@ class TableTop:
         self.albedo = self._estimated_albedo()
 
     def window(self, objects: Box | None) -> Box | None:
-        """Return the box of pixels that show the disc or lie in ``objects``; None if empty."""
+        """Return the box of pixels that show the plane's disc or lie in ``objects``, or None."""
         shown = self._away < 1
         if objects is not None:
             shown[_slices(objects)] = True
@@ -219,7 +219,7 @@ class TableTop:
         return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
     def shape(self, mi: Any) -> dict[str, Any]:
-        """Return Mitsuba's description of the disc."""
+        """Return Mitsuba's description of the disc that represents the plane."""
         up = np.eye(3)[np.abs(self._normal).argmin()]
         target = list(self.centre + self._normal)
         to_world = mi.ScalarTransform4f().look_at(list(self.centre), target, list(up))

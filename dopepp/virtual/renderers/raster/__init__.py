@@ -87,7 +87,7 @@ def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
 
 
 def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
-    """Return the visible fractions of :func:`render` without computing colours."""
+    """Return each object's visible fraction as in :func:`render`, without computing colours."""
     projections = [project_object(item, scene.K) for item in scene.objects]
     samples = draw_samples(scene, projections, (0, 0, *scene.size), CENTRE_SAMPLE)
     owners = np.searchsorted(first_ids(scene), samples.ids[..., 0], side="right") - 1
@@ -137,7 +137,7 @@ def _occluder_box(scene: Scene, projections: Sequence[Projection], index: int) -
 
 
 def _depths(item: SceneObject) -> tuple[float, float]:
-    """Return the smallest and largest depth of an object, metres, with a margin of 2 %."""
+    """Return the smallest and largest depth of an object, metres, with 2 % of margin each."""
     depth = item.surface.hull @ item.T_cam_obj[2, :3] + item.T_cam_obj[2, 3]
     least, most = float(depth.min()), float(depth.max())
     # The hull's extreme points miss a little of a round object.
