@@ -247,7 +247,7 @@ def _is_highest(belief: Array, y: int, x: int) -> bool:
 
 @compiled()
 def _tie_break(belief: Array, y: int, x: int) -> float:
-    """Return the belief of a cell plus :data:`TIE_BREAK` times the sum of the 5×5 cells around."""
+    """Return a cell's belief plus :data:`TIE_BREAK` times the sum of the 5×5 cells around it."""
     total = np.float32(0.0)
     for u in range(max(x - 2, 0), min(x + 3, belief.shape[1])):
         column = np.float32(0.0)

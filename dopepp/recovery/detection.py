@@ -160,7 +160,7 @@ class RecoveryOptions:
 
     @classmethod
     def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
-        """Return the checked options of a config, a checkpoint or a caller, by field name.
+        """Check values by field name, from a config, a checkpoint or a caller, and return options.
 
         Checkpoints of former versions have weights for other features of refined poses. Their
         ``refined_`` options are ignored, so the checkpoint must be tuned again.
@@ -271,7 +271,7 @@ def recalibrate(
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
-    """Return 1 and the log odds of the network's score (``detection.score``) and verification."""
+    """Return 1 and the log odds of the score (before refinement) and ``detection.probability``."""
     assert detection.probability is not None
     verified = _odds(detection.probability, _VERIFIED)
     return np.array([1.0, *np.log([_odds(detection.score), verified])])
@@ -324,7 +324,7 @@ def score(
 def fit_distance_factor(
     estimated: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
 ) -> float:
-    """Return the median ratio of true to estimated distance from the camera; 1 without poses."""
+    """Return the median ratio of true to estimated distance, from T_cam_obj; 1 without poses."""
     if not len(estimated):
         return 1.0
     distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]

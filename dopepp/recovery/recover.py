@@ -79,8 +79,8 @@ def recover(
     """Recover the poses of all objects in one image from its maps.
 
     Args:
-        belief: 9·C belief maps of C objects, as of :func:`~dopepp.maps.codec.encode`.
-        field: 16·C channels of the objects' vector fields.
+        belief: 9·C belief maps of C objects, channels as from :func:`~dopepp.maps.codec.encode`.
+        field: 16·C vector-field maps.
         cuboids: Nine keypoints of each object, object frame, metres.
         K: Camera matrix of the network's input, pixels.
         stride: Pixels of the network's input per cell.

@@ -54,10 +54,10 @@ class Material:
     """Reflectance of a surface (Lambert plus GGX, metallic workflow).
 
     Attributes:
-        colour: Linear albedo in [0, 1] per channel; a factor on the colours of coloured surfaces.
+        colour: Linear albedo in [0, 1] per channel; multiplies the texture or vertex colours.
         roughness: GGX roughness in (0, 1]; 1 is chalk.
         specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
-        metallic: 1 for a metal, which has no diffuse light and reflects its colour.
+        metallic: 1 for a metal, which has no diffuse reflection and a specular one in its colour.
         noise: Relative amplitude of the albedo's noise, clipped to :data:`NOISE_LIMITS`.
         noise_pitch: Distance between the lattice points of the noise, metres.
     """

@@ -37,8 +37,8 @@ class Sensor:
         blur_px: Standard deviation of the defocus blur, pixels.
         motion_px: Displacement (x, y) of the image during the exposure, pixels.
         read_noise: Standard deviation of signal-independent noise, grey levels of 255.
-        shot_noise: Standard deviation of noise that grows with the square root of the signal, at
-            white, grey levels.
+        shot_noise: Standard deviation of signal-dependent noise at white, grey levels. It grows
+            with the square root of the signal.
         jpeg_quality: JPEG quality, 1 to 100; None for no compression.
     """
 

@@ -102,7 +102,7 @@ class Preset(Checked):
 
     @property
     def K(self) -> CameraMatrix:  # noqa: N802 (the field's name of the matrix)
-        """Camera matrix, pixels."""
+        """Camera matrix of the whole image, pixels."""
         if self.intrinsics_px is not None:
             return camera_matrix(*self.intrinsics_px)
         focal = self.width / 2 / math.tan(math.radians(self.horizontal_fov_deg) / 2)

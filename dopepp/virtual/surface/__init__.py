@@ -40,7 +40,7 @@ class Surface:
         patches: Index of every face's smooth patch, int32: faces that connect without a crease.
         uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
         colours: Linear albedo per vertex; shape (0, 3) without colours or with a texture.
-        closed: Watertight with outward winding, so back faces can be dropped.
+        closed: Whether it is watertight with outward winding, so that back faces can be omitted.
         hull: Extreme vertices that bound the mesh's image.
         points: Points spread evenly over the surface, about ``spacing`` apart.
     """
@@ -69,7 +69,7 @@ class Surface:
         return float(np.linalg.norm(self.hull, axis=1).max())
 
     def scaled(self, scale: Vector) -> Surface:
-        """Return the surface stretched along its axes by positive factors.
+        """Return the surface stretched along the object's x, y and z by positive factors.
 
         The open sky is not recomputed, which is accurate enough for factors up to two.
         """

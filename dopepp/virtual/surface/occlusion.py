@@ -25,7 +25,7 @@ _MAP_SIDE: Final = 192  # texels across a depth map
 
 
 class _Points(NamedTuple):
-    """Points on the triangles: positions, unit normals, faces, and the normals of all faces."""
+    """Points on triangles: positions, unit normals, face indices; and unit normals of all faces."""
 
     points: Array
     upright: Array
@@ -55,7 +55,7 @@ _BAKED: Final[dict[bytes, OpenSky]] = {}
 def bake_open_sky(
     vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3 3"], closed: bool
 ) -> OpenSky:
-    """Return the open sky of a mesh; a closed mesh needs no back sides.
+    """Return the open sky (ambient occlusion) of a mesh; a closed mesh needs no back sides.
 
     Results are cached by a hash of the arguments, because a run prepares its parts repeatedly.
     """
@@ -95,7 +95,7 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
 
 
 def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
-    """Return whether all corners lie behind every face's plane, or on it for an open mesh."""
+    """Return whether all corners lie behind every face's plane or, for an open mesh, on it."""
     points = corners.reshape(-1, 3)
     slack = 1e-4 * float(np.ptp(points, axis=0).max())
     heights = points @ flat.T - (corners[:, 0] * flat).sum(axis=1)

@@ -84,7 +84,7 @@ def centres_within(extent: Extent) -> Box:
 
 
 def box_around(boxes: Iterable[Box | None]) -> Box | None:
-    """Return the bounding box of boxes, or None without boxes."""
+    """Return the bounding box of all boxes that are not None; None if there are none."""
     drawn = [box for box in boxes if box is not None]
     if not drawn:
         return None
