@@ -67,7 +67,7 @@ class View:
             raise UserError(f"working_distance={list(self.distance)}", allowed, fix)
 
     def sizes_px(self, parts: Sequence[Part], scale: float = 1.0) -> tuple[float, float]:
-        """Return the smallest (farthest) and largest (nearest) diameter of parts, scaled pixels."""
+        """Return the smallest and largest diameter at any distance, in pixels times ``scale``."""
         diameters = [part.diameter for part in parts]
         near, far = self.distance
         focal = scale * focal_length(self.K)
