@@ -72,7 +72,7 @@ def camera(
     out: Out,
     force: Force = False,
 ) -> None:
-    """Calibrate a camera from images of a board, and write the file for --camera."""
+    """Calibrate a camera from images of a board, and write a file for predict --camera."""
     from dopepp.core.files import check_target
     from dopepp.robot.calibration.board import parse_board
     from dopepp.robot.calibration.lens import calibrate_lens, write_camera

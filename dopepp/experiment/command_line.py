@@ -36,7 +36,7 @@ EVALUATION_SHORT_NAMES: Final = {**SHORT_NAMES, "scale": "scale_factors"}
 def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words: int) -> None:
     """Expand short names in ``sys.argv``, and add the overrides of a run that is resumed.
 
-    The records of a run and its worker processes use the rewritten list. Interpolations of Hydra
+    The records of a run and its worker processes use the rewritten list. Hydra interpolations
     cannot replace short names, because both options would appear in the config.
 
     Args:
@@ -97,7 +97,7 @@ def _resumed(arguments: list[str]) -> list[str]:
 
 
 def convert_error(error: Exception) -> UserError:
-    """Convert an error of Hydra or OmegaConf into a UserError with allowed values and a fix."""
+    """Convert a Hydra or OmegaConf error into a UserError with allowed values and a fix."""
     text = " ".join(f"{error} {error.__cause__ or ''}".split())
     if match := re.search(r"Could not override '([^']+)'", text):
         key = match.group(1)

@@ -203,8 +203,8 @@ def _size(fields: _Fields) -> Size | None:
     if both is not None:
         name, sides = both[0], _numbers(*both)
         if len(sides) != 2:
-            fix = f"write {name}: [width, height]"
-            raise UserError(f"{name} with {len(sides)} numbers", "width and height", fix)
+            fix = "write the image's width and height, e.g. [640, 480]"
+            raise UserError(f"{name} with {len(sides)} numbers", "two numbers", fix)
         return _side(name, sides[0]), _side(name, sides[1])
     width, height = (fields.find(f"image_{side}", side) for side in ("width", "height"))
     if width is None and height is None:

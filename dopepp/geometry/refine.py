@@ -286,7 +286,7 @@ def degenerate(
 
 
 def too_few(num_points: int) -> str:
-    """Return the message for too few points."""
+    """Return the error message that states how many points are usable and how many are needed."""
     return f"only {num_points} usable points, {MIN_POINTS} are needed"
 
 

@@ -287,7 +287,7 @@ class PoseTracker:
                     state.move_to(detection)
 
     def _assigned(self, detections: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
-        """Assign detections by distance to tracked, then to lost or doubtful parts; None: new."""
+        """Match detections to tracked, then to lost or doubtful parts; None marks a new part."""
         pairs: list[tuple[_State | None, Detection]] = []
         for name in self._cuboid_of:
             left = [detection for detection in detections if detection.object == name]

@@ -230,7 +230,7 @@ def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> i
 
 @compiled()
 def _is_highest(belief: Array, y: int, x: int) -> bool:
-    """Return whether a cell is first of its 3×3 cells by belief, tie-break rank, raster order."""
+    """Return whether a cell is a 3×3 maximum; ``_tie_break``, then raster order, resolves ties."""
     value = belief[y, x]
     for v in range(max(y - 1, 0), min(y + 2, belief.shape[0])):
         for u in range(max(x - 1, 0), min(x + 2, belief.shape[1])):

@@ -303,7 +303,7 @@ def _gain(
 
 @compiled()
 def _unrivalled(gain: Array) -> Array:
-    """Return each instance's peak of highest gain per corner; −1: none, RIVALS: peak is shared."""
+    """Return each instance's best peak per corner, or −1 (no peak), or ``RIVALS`` (shared peak)."""
     chosen = np.full(gain.shape[:2], -1, np.int64)
     for k in range(gain.shape[1]):
         for i in range(len(gain)):

@@ -35,7 +35,7 @@ _REDRAWS: Final = 25
 
 
 class Composition:
-    """Objects of one scene that satisfy a preset; ``negatives`` are parts to use as distractors."""
+    """Objects of a scene, within a preset's limits; ``negatives`` are parts for distractors."""
 
     def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
@@ -64,7 +64,7 @@ class Composition:
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
     def add(self, body: Body, T_cam_obj: Transform, material: Material) -> bool:
-        """Add a body if all targets then satisfy the preset; return whether it was added."""
+        """Add a body if every target stays within the preset's limits; return True if added."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
             return False

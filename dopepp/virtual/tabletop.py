@@ -94,7 +94,7 @@ class _TableScene:
         return False
 
     def _candidates(self, body: Body) -> Iterable[_RestingPose]:
-        """Sample resting poses of a body; on a heap, in order of the centre of mass's height."""
+        """Sample a body's resting poses; for a heap, the lowest centre of mass comes first."""
         if not self.table.heaped:
             return self._resting_poses(body)
         # Objects slide down: prefer the lowest pose of two orientations.

@@ -210,7 +210,7 @@ def test_the_error_of_a_faulty_rig_names_the_camera(run, refused, rig_folder, tm
     assert not (tmp_path / "rig.yaml").exists()
     for path in (tmp_path / "rig" / "right").iterdir():
         path.rename(path.with_stem(f"other_{path.stem}"))
-    assert "right without an image of the board together with left" in refused(*words)
+    assert "right without images of the board at the same moments as left" in refused(*words)
     (tmp_path / "rig" / "right.yaml").unlink()
     assert "right.yaml" in refused(*words)
     shutil.rmtree(tmp_path / "rig" / "right")

@@ -67,7 +67,7 @@ def decode_image(
 def image_shape(
     node: Node, content: bytes | None = None, modes: Sequence[str] = ()
 ) -> Shape | None:
-    """Return an image's (height, width) like :func:`decode_image`; if damaged, from the header."""
+    """Return an image's (height, width), or its header's if :func:`decode_image` fails, or None."""
     image = decode_image(node, content, modes)
     if image is not None:
         return image.height, image.width

@@ -54,13 +54,13 @@ class ShadedSample:
 
 
 def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[ShadedSample]:
-    """Return an image's shaded copies, one for each share of the objects' pixels to cover.
+    """Return one copy of an image per share, with this share of each object covered by patches.
 
     Args:
         sample: The image with its annotated objects.
-        shares: Shares of each instance's visible pixels, in [0, 1], one for each result.
-        seed: Seed of the patches.
-        index: Index of the image in the test set.
+        shares: Shares of each instance's visible pixels to cover, in [0, 1], one per result.
+        seed: Seed of the patches, which are crops of the image's background.
+        index: Index of the image in the test set; the patches also depend on it.
 
     Raises:
         ValueError: A share is outside [0, 1].

@@ -362,7 +362,7 @@ def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, 
     merged = dict(base)
     for key, value in changes.items():
         if key not in base and where in _CLOSED:
-            fix = f"write {where}. and one of these names"
+            fix = f"write one of these names after {where}."
             raise UserError(f"{where}.{key}={value}", ", ".join(base), fix)
         nested = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
         merged[key] = _changed(base[key], value, f"{where}.{key}") if nested else value

@@ -55,7 +55,7 @@ class Run:
     """A training, evaluation or cost measurement, as read from its run folder.
 
     Attributes:
-        overrides: Overrides of the run, without options of Hydra, locations and devices.
+        overrides: Overrides of the run, but not those of locations, devices or Hydra itself.
         report: Result on the test set, or None.
         failure: Reason for a missing result; empty if no result was requested (``job=cost``).
         config: Resolved config; empty if the run has none.
@@ -234,7 +234,7 @@ def _read_result(run: Run) -> None:
 
 
 def overrides_of(folder: Path) -> list[str]:
-    """Return a run's stored overrides, without options of Hydra, locations and devices."""
+    """Return a run's stored overrides, but not those of locations, devices or Hydra itself."""
     listed = _yaml(folder / _HYDRA / "overrides.yaml")
     texts = [str(text).lstrip("+") for text in listed] if isinstance(listed, list) else []
     ignored = tuple(f"{name}=" for name in _ELSEWHERE)

@@ -272,8 +272,8 @@ def measure_shading(
     Args:
         methods: Methods by name.
         source: Test images.
-        shares: Shares to cover, ascending, without 0.
-        seed: Seed of the patches.
+        shares: Shares of the visible area to cover, ascending, without 0.
+        seed: Seed of the patches that cover the instances.
         unmasked: Reports of the methods without shading.
         num_examples: Number of images on the sheet of examples.
 

@@ -213,8 +213,8 @@ class FileMethod:
         unused = [row for rows in self._unused.values() for row in rows]
         if unused and not used:
             raise UserError(
-                f"{self._path}, whose {len(unused):,} poses are all on other images, e.g. scene "
-                f"{unused[0].scene_id}, image {unused[0].im_id}",
+                f"{self._path}, whose {len(unused):,} poses are all on images outside the "
+                f"test set, e.g. scene {unused[0].scene_id}, image {unused[0].im_id}",
                 f"images of the test set, e.g. scene and image {next(iter(self._used), 'none')}",
                 "select the images of the file, e.g. with data.image_sets.test",
             )

@@ -167,7 +167,7 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
             _log.warning(
-                "%s: ignoring %r, because options of Hydra are not read from a run", source, text
+                "%s: ignoring %r, because Hydra options are not read from a run", source, text
             )
             continue
         kept.append(text)

@@ -164,7 +164,7 @@ def _tile_of(length: int, start: int, extent: int, tiles: int) -> Int[np.ndarray
 
 @compiled()
 def _bins(image: Array, bins: Array) -> None:
-    """Write each pixel's colour bin: four bits per channel."""
+    """Write each pixel's colour bin to ``bins``: four bits per channel."""
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
             r, g, b = image[v, u, 0] >> 4, image[v, u, 1] >> 4, image[v, u, 2] >> 4

@@ -234,7 +234,7 @@ class _ViewSearch:
         return stage.contour(pose) is not None
 
     def terms(self, left: int) -> list[Term]:
-        """Return the depth and outline terms of a round, for the pose in the world."""
+        """Return the depth and outline terms of a refinement round, for the pose in the world."""
         terms = [*self._depth, self.round(left).term(self._reach)]
         return [ViewTerm(term, self._view) for term in terms]
 

@@ -293,7 +293,7 @@ def _walk(
         pixels: Projected vertices.
         distance: Depth of the object's origin, metres.
         mask: Mask of the silhouette.
-        spacing: Distance of two points, pixels.
+        spacing: Distance between neighbouring points, pixels.
 
     Returns:
         Arm (3), pixel (2) and outward normal (2) of each point.

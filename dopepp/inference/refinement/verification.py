@@ -384,7 +384,7 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
         sides: The two triangles of each crease.
         pixels: Projected vertices.
         ids: Triangle at each pixel.
-        spacing: Distance of two points, pixels.
+        spacing: Distance between neighbouring points, pixels.
 
     Returns:
         Pixel (2) and unit normal (2) of each point.

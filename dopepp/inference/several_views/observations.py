@@ -53,7 +53,7 @@ class PartGeometry:
         return Prior(np.asarray(equal[distances.argmin()]), pose.information)
 
     def separation(self, pose: Prior, other: Prior) -> float:
-        """Return the Mahalanobis distance of two poses; see :meth:`nearest` for symmetric parts."""
+        """Return two poses' Mahalanobis distance; see :meth:`nearest` for symmetric parts."""
         return separation(pose, self.nearest(other, pose.T_cam_obj))
 
     def mean(self, poses: Sequence[Prior]) -> Prior:

@@ -92,7 +92,7 @@ def _by_phase(responses: Responses, rows: int, columns: int, margin: int) -> Res
 
 @compiled()
 def _add(flat: Array, starts: Array, total: Array) -> None:
-    """Write the sum of rows of equal length that start at the given indices."""
+    """Write to ``total`` the sum of the rows of ``flat`` that start at the indices ``starts``."""
     count = len(total)
     for p in range(0, len(starts), TOGETHER):
         a, b = flat[starts[p] : starts[p] + count], flat[starts[p + 1] : starts[p + 1] + count]

@@ -254,7 +254,7 @@ def _describe(
     poses: Array,
     features: Array,
 ) -> None:
-    """Write the features of each match that depend on the image, except the mean response."""
+    """Write to ``features`` each match's image features, except the mean response."""
     bins, height, width = maps.shape
     mean, colours = np.zeros(3), np.zeros((inner.shape[1], 3))
     for i in range(len(views)):

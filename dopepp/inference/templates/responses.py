@@ -48,7 +48,7 @@ def edge_responses(image: RGBImage, spread: int, surroundings: int) -> Responses
 
 @compiled()
 def _orient(gx: Array, gy: Array, maps: Array) -> None:
-    """Write the response of each pixel to its strongest gradient over the channels."""
+    """Write to ``maps`` each pixel's response to the strongest gradient of its channels."""
     bins, height, width = maps.shape
     cosines, sines = np.empty(bins), np.empty(bins)
     for b in range(bins):

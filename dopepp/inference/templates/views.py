@@ -186,7 +186,7 @@ def _spread(
 
 @compiled()
 def _farthest(points: Array, chosen: Array) -> None:
-    """Write indices of points, each the farthest from all points before it."""
+    """Write to ``chosen`` indices of points, each the farthest from all points before it."""
     distance, farthest = np.full(len(points), np.inf), 0
     for i in range(len(chosen)):
         if i >= len(points):

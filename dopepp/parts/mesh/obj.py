@@ -67,7 +67,7 @@ def read_obj(path: Path) -> RawMesh:
 
 @dataclass
 class ObjFile:
-    """Statements of an OBJ file, indices from 0, in arrays (a tenth of the memory of lists)."""
+    """Statements of an OBJ file, 0-based indices, in arrays (a tenth of the memory of lists)."""
 
     positions: array[float] = field(default_factory=lambda: array("d"))  # x, y, z of each v
     coordinates: array[float] = field(default_factory=lambda: array("d"))  # u, v of each vt
@@ -117,7 +117,7 @@ def _numbers(words: list[str], count: int) -> list[float]:
 
 
 def _index(word: str, count: int) -> int:
-    """Convert an index from 1, or from the end if negative, to an index from 0."""
+    """Convert a 1-based index, or a negative index from the end, to a 0-based index."""
     index = int(word)
     if not 1 <= abs(index) <= count:
         raise ValueError(f"index {index} among {count}")

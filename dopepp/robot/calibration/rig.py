@@ -137,10 +137,10 @@ def _link_cameras(poses: BoardPoses) -> dict[str, Transform]:
         }
         anchor, name = max(shared, key=lambda pair: len(shared[pair]))
         if not shared[anchor, name]:
-            problem = f"{', '.join(others)} without an image of the board together with "
+            problem = f"{', '.join(others)} without images of the board at the same moments as "
             problem += ", ".join(linked)
-            allowed = "images of the same name that show the board to both cameras"
-            fix = "hold the board where a calibrated camera sees it too, and take images again"
+            allowed = "images of the same name in which two cameras see the board"
+            fix = "hold the board in view of two cameras at once, and take images again"
             raise UserError(problem, allowed, fix)
         steps = np.stack(
             [

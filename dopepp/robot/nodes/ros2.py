@@ -118,7 +118,7 @@ class _Node:
         self.handle.add_on_set_parameters_callback(self._change)
 
     def _change(self, parameters: Any) -> Any:
-        """Change the worker's settings to new ROS parameters; change none if one is invalid."""
+        """Apply new ROS parameters to the worker, or none if one is invalid; return the result."""
         from rcl_interfaces.msg import SetParametersResult
 
         names = asdict(self._worker.settings)

@@ -122,7 +122,7 @@ def test_a_results_file_of_other_data_is_rejected(root, composed, tmp_path):
     path = tmp_path / "results.csv"
     write_results(path, [replace(results(root)[0], scene_id=3)])
     config = composed(*options(root, f"results={path}"), config="evaluate")
-    with pytest.raises(UserError, match=r"results\.csv.* on other images, e.g. scene 3"):
+    with pytest.raises(UserError, match=r"results\.csv.* outside the test set, e.g. scene 3"):
         run_evaluation(config, tmp_path / "run")
 
 

@@ -89,7 +89,7 @@ def test_a_camera_is_linked_through_another():
 def test_a_camera_that_never_shares_the_board_is_named():
     boards = draw_detections()
     boards["top"] = {f"other {name}": seen for name, seen in boards["top"].items()}
-    with pytest.raises(UserError, match="top without an image of the board together with left"):
+    with pytest.raises(UserError, match="top without images of the board at the same moments"):
         calibrate_rig(boards, LENSES)
 
 

@@ -182,7 +182,7 @@ def _check_repeats(path: Path, table: Table) -> None:
 
 
 def _check_unit(path: Path, table: Table) -> None:
-    """Raise a UserError if the median distance is not plausible in millimetres."""
+    """Raise a UserError if the median distance from the camera is implausible in millimetres."""
     if not len(table):
         return
     distances = np.linalg.norm(table[:, 14:17], axis=1)

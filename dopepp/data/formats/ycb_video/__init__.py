@@ -25,7 +25,7 @@ FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
 
 
 def read_classes(root: Path) -> list[str]:
-    """Return the names in ``image_sets/classes.txt``; a class index is the line number from 1.
+    """Return the names in ``image_sets/classes.txt``; a class index is the 1-based line number.
 
     Raises:
         UserError: The folder is not one of YCB-Video.

@@ -64,12 +64,12 @@ MIN_FOUND: Final = 20  # smallest number of points that agree with their depth
 class DepthStage:
     """A stage of the fit to depth; lengths are in diameters of the part unless stated otherwise."""
 
-    reach: float  # largest distance from a plane that has a weight
+    reach: float  # distance from a plane above which a pixel has no weight
     steps: int = 2  # Gauss–Newton steps
     update_visible: bool = False  # whether the visible points are determined again
     search: float = 0.0  # step of the search across the viewing axis; 0 for no search
     tolerance: float = 0.0  # largest depth error in the search, standard deviations
-    outline: float = 0.0  # largest difference of outlines that has a weight; 0 for none
+    outline: float = 0.0  # like ``reach``, between the outlines; 0 for no outline terms
 
 
 FINE: Final = DepthStage(0.03, steps=3, update_visible=True, outline=0.05)

@@ -48,8 +48,8 @@ class DepthTerm:
     view: DepthView
     surface: SurfacePoints
     is_visible: Visible
-    reach: float  # largest distance from a plane that has a weight, metres
-    outline: float  # largest difference of outlines that has a weight, metres; 0 for no outline
+    reach: float  # distance from a plane above which a pixel has no weight, metres
+    outline: float  # like ``reach``, between the outlines, metres; 0 for no outline terms
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the term at a pose; None if no point is within the view."""
@@ -74,7 +74,7 @@ def plane_terms(
         overlay: Comparison of the posed part with the depth.
         origin: Object's origin, camera frame.
         spacing: Spacing of the part's points.
-        reach: Largest distance from a point's plane that has a weight.
+        reach: Distance from a point's plane above which a pixel has no weight.
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
     planes = overlay.distance, overlay.nearest, overlay.points, overlay.normals
@@ -89,8 +89,8 @@ def outline_terms(
 ) -> NormalEquations:
     """Return normal equations of the outline terms; see :func:`plane_terms` for the arguments.
 
-    ``spacing`` is also the standard deviation of a point, and ``reach`` the largest difference
-    between the outlines that has a weight.
+    ``spacing`` is also the standard deviation of an outline point's position. Where the outlines
+    differ by more than ``reach``, a point has no weight.
     """
     gate = GATE * view.noise
     offset = overlay.at_points

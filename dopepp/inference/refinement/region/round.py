@@ -60,7 +60,7 @@ FARTHEST: Final = 4.5
 
 @dataclass(frozen=True)
 class RegionStage:
-    """Resolution and search distance of a round."""
+    """Settings of one refinement round, such as resolution and search distance."""
 
     longest_px: int  # length of the part above which the image is shrunk
     reach: float  # length of the normals, share of the first search distance
@@ -267,5 +267,5 @@ class Round:
 
 
 def _step(reach: float) -> float:
-    """Return the distance of samples along a normal, for a search distance (both pixels)."""
+    """Return the distance between samples along a normal, for a search distance (both pixels)."""
     return min(max(1.0, reach / SAMPLES), 4.0)

@@ -85,18 +85,18 @@ def find_shifts(
 def _changes(
     colours: Array, pixels: Array, normals: Array, step: float, count: int, changes: Array
 ) -> float:
-    """Write the change of the image between neighbouring samples along each normal.
+    """Measure how much the image changes between neighbouring samples along each normal.
 
-    The change is the difference between the means of two samples before and two samples after, in
-    the channel in which it is largest.
+    A change is the difference between the mean of the next two samples and the mean of the previous
+    two, in the channel in which this difference is largest.
 
     Args:
-        colours: Crop of the image.
+        colours: RGB crop of the image.
         pixels: Points of the projected outline.
         normals: Outward unit normal of each point.
-        step: Distance of two samples, pixels.
+        step: Distance between samples, pixels.
         count: Number of samples to either side of a point.
-        changes: Filled with the changes of each point.
+        changes: Filled with the 2·count + 2 changes of each point, grey levels.
 
     Returns:
         The mean change plus ``MIN_CHANGE``, grey levels.
@@ -140,7 +140,7 @@ def _shifts(
     edge: float,
     shifts: Array,
 ) -> None:
-    """Write mean and information of the shift of the part's border along each normal.
+    """Estimate the shift of the part's border along each normal, and its information.
 
     Args:
         odds: Log odds of part against surroundings for every pixel.
@@ -148,7 +148,7 @@ def _shifts(
         normals: Outward unit normal of each point.
         changes: Change of the image between neighbouring samples of each normal.
         strength: Change that counts as an edge.
-        step: Distance of two samples, pixels.
+        step: Distance between samples, pixels.
         count: Number of samples to either side of a point.
         colour: Weight of the colours.
         edge: Weight of the edges.

@@ -66,7 +66,7 @@ def bounding_sphere(scene: Scene) -> Sphere:
 
 
 def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
-    """Return the radius, metres, of a lamp: ``LAMP_SHARE`` of its distance, less near objects."""
+    """Return a lamp's radius, metres: ``LAMP_SHARE`` of its distance, reduced close to objects."""
     position = np.array(light.position)
     distance = float(np.linalg.norm(position - bounds[0]))
     room = [float(np.linalg.norm(position))]

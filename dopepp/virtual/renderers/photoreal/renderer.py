@@ -261,10 +261,10 @@ class TableTop:
 
 
 def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colours, Colours]:
-    """Split radiance into the objects' radiance and the share of light that reaches the disc.
+    """Split radiance into the objects' radiance and the share of light that reaches the plane.
 
-    ``alpha`` is the share of a pixel that objects cover; ``unshadowed`` is the radiance of the disc
-    without objects, 0 outside the disc.
+    ``alpha`` is the share of a pixel that objects cover. ``unshadowed`` is the radiance, without
+    objects, of the disc that represents the supporting plane; 0 outside the disc.
     """
     is_disc = (alpha <= 0) & (unshadowed.min(axis=-1) > _MIN_LIGHT)
     light_share = np.where(is_disc[..., None], light / np.maximum(unshadowed, _MIN_LIGHT), 1.0)

@@ -304,7 +304,7 @@ def _clear_to_plane(
 
 @compiled()
 def _plane_depth(inverse: Array, near: float, depth: Array) -> None:
-    """Write the plane's depth at every pixel centre, metres; 0 where the plane is not visible."""
+    """Write to ``depth`` the plane's depth at each pixel, metres; 0 where it is not visible."""
     for j in range(depth.shape[0]):
         for i in range(depth.shape[1]):
             value = inverse[0] * i + inverse[1] * j + inverse[2]
