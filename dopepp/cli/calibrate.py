@@ -384,9 +384,9 @@ def _bench_from_board(
     from dopepp.robot.calibration.tool import bench_of_board
 
     if camera is None or hand_eye is None:
-        problem = "--board without --camera and --hand-eye"
+        problem = "--board without --camera or --hand-eye"
         fix = "add the files from `dopepp calibrate camera` and `dopepp calibrate handeye`"
-        raise UserError(problem, "both options", fix)
+        raise UserError(problem, "--board with both --camera and --hand-eye", fix)
     content = read_yaml(hand_eye)
     record = content if isinstance(content, dict) else {}
     on_flange = "T_flange_cam" in record

@@ -80,8 +80,8 @@ def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
 
     Args:
         path: File, with any suffix.
-        longest_px: Longest side, pixels; larger images are reduced (a JPEG is then decoded at a
-            fraction of its size and time).
+        longest_px: Maximum of the longer side, pixels. Larger images are downscaled; a JPEG is
+            then decoded at a reduced size, which is faster.
 
     Raises:
         ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.

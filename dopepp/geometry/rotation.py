@@ -118,7 +118,7 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
 def is_rigid(T: Float[np.ndarray, "4 4"], tolerance: float = 1e-3) -> bool:
     """Return whether a matrix is a finite 4×4 rigid transform, with the last row 0, 0, 0, 1.
 
-    ``tolerance`` is the largest absolute entry of R Rᵀ − I for the rotation R.
+    ``tolerance`` is the largest allowed absolute entry of R Rᵀ − I for the rotation R.
     """
     return (
         T.shape == (4, 4)

@@ -472,7 +472,7 @@ class PoseEstimator:
         return network_views(self.checkpoint, multiple, image, K, distances, roi)
 
     def maps(self, image: RGBImage) -> Maps:
-        """Return belief and field maps of an RGB image whose sides ``size_multiple`` divides."""
+        """Return belief and field maps of an RGB image (sides: multiples of ``size_multiple``)."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():
             belief, field = self.network.maps(pixels)

@@ -251,7 +251,7 @@ def check_region(roi: Region | None, image: RGBImage) -> Region | None:
 def resize_and_pad(
     image: RGBImage, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Resize an image, and pad it at the right and bottom to sides that ``multiple`` divides."""
+    """Resize an image, and pad it at the right and bottom to sides in multiples of ``multiple``."""
     image = letterbox.image(image)
     rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))

@@ -94,9 +94,9 @@ def serve_page(estimator: PoseEstimator, port: int | None = None) -> Iterator[st
         try:
             _, address, _ = page.launch(server_port=port, **LAUNCH)
         except OSError as error:
-            taken = "every port from 7860 on" if port is None else f"--port {port}"
-            fix = "end the program that uses it, or pass another port, e.g. --port 8000"
-            raise UserError(f"{taken}, which is taken", "a free port", fix) from error
+            taken = "no free port from 7860 on" if port is None else f"--port {port} already in use"
+            fix = "pass another port, e.g. --port 8000, or stop the program that uses the port"
+            raise UserError(taken, "a free port", fix) from error
         try:
             yield address
         finally:

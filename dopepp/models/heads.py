@@ -241,12 +241,12 @@ class MultiScaleBranch(Branch):
 
     @property
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions of the scales' maps, if learned, and of the fused maps."""
+        """The convolutions that produce the maps of the scales (if learned) and the fused maps."""
         scales = [self.down_quarter, self.down_half, self.down_full] if self.learned else []
         return [*(cast(nn.Conv2d, scale[-1]) for scale in scales), self.output]
 
     def forward(self, features: Features) -> list[Features]:
-        """Return the fused maps, after those of the scales if learned; sides are multiples of 4."""
+        """Return the maps of the scales (if learned) and the fused maps; sides: multiples of 4."""
         full = self.down_full(features)
         half = self.down_half(full)
         quarter = self.down_quarter(half)

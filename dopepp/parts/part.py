@@ -332,7 +332,7 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
         return
     written = diameter / UNITS[unit]
     likely = [u for u, s in UNITS.items() if SMALLEST_DIAMETER <= written * s <= LARGEST_DIAMETER]
-    problem = f"part {name!r} with a diameter of {diameter:.4g} m, its file read with unit={unit}"
+    problem = f"part {name!r} with a diameter of {diameter:.4g} m, from a mesh with unit={unit}"
     fix = (
         f"state the file's unit: unit={likely[0]}" if likely else "export the part at its real size"
     )

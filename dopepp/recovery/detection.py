@@ -282,8 +282,8 @@ def detection_features(
 ) -> Float[np.ndarray, "features"]:
     """Return the values of :data:`FEATURES`, from which a logistic model computes the score.
 
-    They are 1, the log odds of the mean belief, the logarithms of the corners' predicted error and
-    of the reprojection error over the part's size, and minus the share of missing keypoints.
+    Features: 1, log odds of the mean belief, logarithms of the corners' expected error and of the
+    reprojection error (both relative to the part's size), and negative share of missing keypoints.
 
     Args:
         detection: Detection before refinement.

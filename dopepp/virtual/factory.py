@@ -175,10 +175,10 @@ class Factory:
 
 
 def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
-    """Return the shift of the world in the camera frame, metres, for a magnification > 0.
+    """Return the shift of the world, camera frame, metres, that magnifies the targets.
 
-    The distance from the camera to the mean of the targets' centres is divided by ``scale``;
-    without a target, the shift is 0.
+    The shift divides the distance of the targets' mean centre from the camera by ``scale``, a
+    positive number. Without targets, the shift is zero.
     """
     middle = _middle(objects)
     return np.zeros(3) if middle is None or scale == 1 else np.asarray((1 / scale - 1) * middle)
@@ -200,7 +200,7 @@ def _draw_camera(scene: Scene, rng: Generator) -> Transform:
 
 
 def _middle(objects: Sequence[SceneObject]) -> Vector | None:
-    """Return the mean of the targets' cuboid centres, camera frame, metres; None without target."""
+    """Return the targets' mean cuboid centre (camera frame, metres), or None without targets."""
     pairs = [(item.T_cam_obj, item.part) for item in objects if item.part is not None]
     centres = [transform(T_cam_obj, part.cuboid[CENTROID]) for T_cam_obj, part in pairs]
     return np.mean(centres, axis=0) if centres else None

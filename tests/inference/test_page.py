@@ -147,7 +147,7 @@ def test_used_port_is_reported(page):
     port = int(page.url.rstrip("/").rsplit(":", 1)[1])
     estimator = PoseEstimator.load("pretrained/pivconnector")
     with (
-        pytest.raises(UserError, match=f"--port {port}, which is taken"),
+        pytest.raises(UserError, match=f"--port {port} already in use"),
         serve_page(estimator, port),
     ):
         raise AssertionError

@@ -110,7 +110,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
 def plausible_camera(
     node: Node, K: CameraMatrix | None, shape: Shape | None
 ) -> CameraMatrix | None:
-    """Return K (pixels); None if K is missing, not finite or, which is reported, implausible."""
+    """Return K (pixels); None if it is missing, not finite or implausible (which is reported)."""
     if K is None or not np.isfinite(K).all():
         return None
     if shape is None:

@@ -48,7 +48,7 @@ class Problems:
             allowed: Allowed values; empty if the message implies them.
 
         Raises:
-            UserError: In this class, always.
+            UserError: Always; a subclass may store the problem instead.
         """
         fix = "correct the file, or copy it again; `dopepp check` lists all problems of a data set"
         parts = str(path), where.lstrip("."), message
@@ -58,7 +58,7 @@ class Problems:
         """Report an error that a function raised while it read a file.
 
         Raises:
-            UserError: In this class, always: ``error``.
+            UserError: Always, ``error`` itself; a subclass may store the error instead.
         """
         raise error
 

@@ -322,7 +322,7 @@ def evaluation_data(
 
 
 def stored_config(description: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the data config in ``Checkpoint.data``, or None if it has none."""
+    """Return the data config in a checkpoint's ``data``, or None if ``data`` contains no config."""
     config = description.get("config")
     return config if isinstance(config, dict) else None
 

@@ -154,7 +154,7 @@ def _git(*arguments: str) -> bytes | None:
 
 
 def _git_state() -> dict[str, Any] | None:
-    """Return commit, dirty flag and untracked files of the package's repository, None without."""
+    """Return commit, dirty flag and untracked files of the repository; None outside git."""
     # A package that is installed inside another repository is outside git.
     is_part = _git("ls-files", "--error-unmatch", "__init__.py") is not None
     commit, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")

@@ -132,7 +132,7 @@ def _output_path(path: Path, layout: str, precision: str, out: Path | None) -> P
         raise UserError(problem, "a new path, or an earlier export", "pass a new path with --out")
     if out.exists() and path.exists() and out.samefile(path):
         fix = "pass another path with --out"
-        raise UserError(f"--out {out}, which is the checkpoint", "a path of another file", fix)
+        raise UserError(f"--out {out}, which is the checkpoint", "the path of another file", fix)
     return out
 
 

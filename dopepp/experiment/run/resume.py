@@ -229,10 +229,10 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 
 
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
-    """Return the differences between two results of :func:`describe_images`, a text for each.
+    """Return descriptions of the differences between two results of :func:`describe_images`.
 
-    Descriptions of presets are ignored, because a new version may add fields to a preset. The first
-    image shows whether a preset has changed.
+    Descriptions of presets are ignored, because a new version may add fields to a preset. Changed
+    presets are recognised by the labels and pixels of the first image.
     """
     old, new = dict(flatten(stored["sources"])), dict(flatten(present["sources"]))
     presets = {f"{source}.preset" for source in present["sources"]}

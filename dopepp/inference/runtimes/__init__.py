@@ -106,7 +106,7 @@ class ExportedNetwork(ABC):
         """Return the belief maps, after the activation, and the vector field of images.
 
         Args:
-            images: RGB, uint8, (batch, 3, height, width); ``size_multiple`` divides the sides.
+            images: RGB, uint8, (batch, 3, height, width); sides are multiples of ``size_multiple``.
 
         Raises:
             UserError: The graph fails, or its maps contradict its description.

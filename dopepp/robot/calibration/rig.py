@@ -162,9 +162,9 @@ def _most_central(steps: Transforms) -> Transform:
 
 
 class _Adjustment:
-    """Bundle adjustment: refines the poses of cameras and boards by all reprojection errors.
+    """Bundle adjustment: minimises all reprojection errors over poses of cameras and boards.
 
-    The unknowns are a rotation and translation of each camera but the first, then of each board.
+    The unknowns are rotation and translation of each camera except the first, then of each board.
     """
 
     def __init__(self, boards: Boards, cameras: Mapping[str, Camera], poses: BoardPoses) -> None:

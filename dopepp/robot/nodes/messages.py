@@ -74,13 +74,13 @@ class Triangles:
 
 
 class AnswerFormatter:
-    """Converter from the answers of a worker to ROS messages.
+    """Converts a worker's answers to ROS messages.
 
     Args:
-        parts: Parts that the worker detects; markers need their meshes.
+        parts: Parts that the worker detects; a part without a mesh has an empty marker.
 
     Raises:
-        UserError: Two names of parts are equal after characters outside [A-Za-z0-9_] become _.
+        UserError: Part names coincide after characters outside [A-Za-z0-9_] are replaced by _.
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:

@@ -110,7 +110,7 @@ class Preset(Checked):
         return camera_matrix(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
     def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
-        """Sample K and (width, height), pixels, of the rendered image or window.
+        """Return K and (width, height), pixels, of the image or, with ``window``, of a random crop.
 
         A window is centred on a uniformly sampled point, then shifted into the image. A window
         larger than the image is centred on the image.

@@ -226,13 +226,13 @@ class FillPlacement(_Placement):
     kind: Literal["fill"] = "fill"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Return the object's origin in the camera frame, metres.
+        """Sample the object's origin in the camera frame, metres.
 
         Args:
             rng: Random generator.
             K: Camera matrix, pixels.
             size: (width, height) of the image.
-            rotated_hull: Corners of the part's convex hull, relative to its origin, camera axes.
+            rotated_hull: Vertices of the object's convex hull relative to its origin, camera axes.
         """
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)

@@ -71,7 +71,7 @@ class Surface:
     def scaled(self, scale: Vector) -> Surface:
         """Return the surface stretched along the object's x, y and z by positive factors.
 
-        The open sky is not recomputed, which is accurate enough for factors up to two.
+        Ambient occlusion is not recomputed, which is accurate enough for factors up to two.
         """
         normals = self.normals / np.asarray(scale, np.float32)
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-20)

@@ -55,7 +55,7 @@ _BAKED: Final[dict[bytes, OpenSky]] = {}
 def bake_open_sky(
     vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3 3"], closed: bool
 ) -> OpenSky:
-    """Return the open sky (ambient occlusion) of a mesh; a closed mesh needs no back sides.
+    """Return the ambient occlusion of a mesh; back sides of a closed mesh are not computed.
 
     Results are cached by a hash of the arguments, because a run prepares its parts repeatedly.
     """
@@ -72,7 +72,7 @@ def bake_open_sky(
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
-    """Compute the open sky of a mesh from depth maps in 24 to 256 directions."""
+    """Compute the ambient occlusion of a mesh from depth maps in 24 to 256 directions."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
@@ -223,7 +223,7 @@ def _bake(
 def look_up_sky(
     face: Array, share: Array, steps: Array, firsts: Array, values: Array, out: Array
 ) -> None:
-    """Fill ``out`` with the open sky at an object's fragments.
+    """Interpolate the unhidden share of the sky at an object's fragments into ``out``.
 
     ``face`` and ``share`` are fields of :class:`Fragments`; ``steps``, ``firsts`` and ``values``
     are fields of :class:`OpenSky`.

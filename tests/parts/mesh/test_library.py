@@ -174,7 +174,7 @@ def test_a_glb_file_is_in_metres_and_another_unit_is_logged(write, caplog):
         assert caplog.messages == ["box: 30 × 20 × 10 mm, read in m"]
     assert np.ptp(read_mesh(path, "cm").vertices) == pytest.approx(0.0003)
     assert f"{path} is in m by its format, but read in cm as requested" in caplog.text
-    with pytest.raises(UserError, match=r"37\.42 m, its file read with unit=m; .*unit=mm"):
+    with pytest.raises(UserError, match=r"37\.42 m, from a mesh with unit=m; .*unit=mm"):
         load_part(write("large.glb", exported(BOX, "glb")))
 
 

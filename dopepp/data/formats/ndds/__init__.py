@@ -257,7 +257,7 @@ def _intrinsics(values: Mapping[str, Any], node: Node) -> CameraMatrix:
 
 
 def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
-    """Read an item's depth image in metres along z; None without a depth image of known unit.
+    """Read an item's depth image, metres along z; None if it is missing or its unit is unknown.
 
     Args:
         record: The annotation, which may state the unit.

@@ -52,7 +52,7 @@ class NddsReader:
         parts: Objects to return. An instance's ``class`` is a part's name, FAT's form of that name
             (``NAME_16k``), or a key of ``classes``.
         part_of: Share of the sorted items to use as (first, last) fractions, e.g. (0, 0.9).
-        classes: Names of parts by class names in the files.
+        classes: Part names by the class names in the files.
 
     Raises:
         UserError: The folder has no items, no instance of the parts, or no clear convention.

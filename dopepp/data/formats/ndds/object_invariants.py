@@ -140,7 +140,7 @@ class ObjectCheck:
         check_box(self._node["box"], points, K, visible_box, fraction, shape)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
-        """Return a field's numbers; None if missing or, which is reported, damaged."""
+        """Return a field's numbers; None if they are missing or damaged; damage is reported."""
         value = self._item.get(field)
         return None if value is None else _finite(self._node[field].numbers(value, *shape))
 

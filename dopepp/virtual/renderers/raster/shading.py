@@ -1,7 +1,7 @@
 """Shading: the light that an object's visible fragments send to the camera.
 
-Each pass works on all fragments of an object: colour, grooves, the open sky, and each light with
-its shadow map. Arrays are float32. π is left out of every term: a white diffuse surface under
+Each pass works on all fragments of an object: colour, grooves, ambient occlusion, and each light
+with its shadow map. Arrays are float32. π is left out of every term: a white diffuse surface under
 intensity 1 has radiance 1.
 
 Grooves (layer lines of a print, brushed metal) are a sine of the distance along an axis, mixed with
