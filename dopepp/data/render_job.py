@@ -305,7 +305,7 @@ def _differences(stored: object, current: object, where: str) -> Iterator[str]:
 
 
 def _remove_abandoned(root: Path) -> None:
-    """Remove partial files of killed processes, but no file of a running shard."""
+    """Remove the partial files of killed processes; keep those of shards still being rendered."""
     clock = partial_path(root / "clock")
     clock.touch()
     now = clock.stat().st_mtime

@@ -37,8 +37,8 @@ from dopepp.training.system import PoseSystem, ValidationOutput
 _log = logging.getLogger(__name__)
 
 LOGGED: Final = (
-    "add_01d", "add_s_01d", "pass_5cm", "pass_10cm", "auc_10cm", "auc_s_10cm", "ar_mssd",
-    "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
+    "add_01d", "add_s_01d", "add_or_s_01d", "pass_5cm", "pass_10cm", "auc_10cm", "auc_s_10cm",
+    "ar_mssd", "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
 )  # fmt: skip
 _OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")  # Undefined without matches
 
@@ -80,13 +80,14 @@ class PoseMetricsCallback(Callback):
         areas = [row.auc_s_10cm if row.num_symmetries > 1 else row.auc_10cm for row in objects]
         counted = [area for area in areas if area is not None]
         values["selection"] = sum(counted) / len(counted) if counted else None
+        on_bar = "add_or_s_01d" if any(row.num_symmetries > 1 for row in objects) else "add_01d"
         for name, value in values.items():
             # ModelCheckpoint needs a value even if the validation images have no objects.
             if value is None and name not in _OF_MATCHES:
                 value = math.nan
             if value is not None:
-                on_bar = name == "add_01d"
-                pl_module.log(f"val/{name}", float(value), prog_bar=on_bar, rank_zero_only=False)
+                shown = name == on_bar
+                pl_module.log(f"val/{name}", float(value), prog_bar=shown, rank_zero_only=False)
 
 
 def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:

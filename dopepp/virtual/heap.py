@@ -7,6 +7,7 @@ and light.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -15,9 +16,8 @@ from jaxtyping import Float
 from numpy.random import Generator
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform, make_transform, project, transform
+from dopepp.geometry.camera import Transform, focal_length, make_transform, project, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.parts.mesh import largest_distance
 from dopepp.virtual.arrangement import Composition
 from dopepp.virtual.body import Body, bin_pieces, bin_walls
 from dopepp.virtual.presets.table import Pile, Table
@@ -29,6 +29,7 @@ _LARGEST: Final = 2.0  # largest diameter of a negative over that of the largest
 _GAP: Final = 0.01  # smallest distance between layers of falling objects, diameters
 _MIN_ROOM: Final = 1.2  # smallest side of the drop area, diameters
 _TRIALS: Final = 8
+_BESIDE: Final = 1.0  # objects beside a window are omitted if farther than this, diameters
 
 Sides = Float[np.ndarray, "3"]  # inner width, depth and height of a bin, metres
 
@@ -52,12 +53,10 @@ def arrange_heap(
         UserError: The objects do not come to rest.
     """
     preset, rng = composition.preset, composition.rng
-    hulls = (body.surface.hull for body in targets)
-    diameter = max(map(largest_distance, hulls), default=0.3 * table.distance[0])
+    diameters = (body.surface.diameter for body in targets)
+    diameter = max(diameters, default=0.3 * table.distance[0])
     bodies, limit = list(targets), _LARGEST * diameter
-    negatives = [
-        body for body in composition.negatives if largest_distance(body.surface.hull) < limit
-    ]
+    negatives = [body for body in composition.negatives if body.surface.diameter < limit]
     low, high = preset.distractors.number
     for _ in range(int(drawing.integers(low, high + 1))):
         bodies.append(preset.distractors.draw(drawing, _IMAGE_WIDTH * diameter, negatives))
@@ -67,12 +66,15 @@ def arrange_heap(
         bodies, poses = [*bodies, bin_walls().stretched(sides)], [*poses, np.eye(4)]
     materials = [composition.draw_material(body) for body in bodies]
     reach = np.abs([pose[:2, 3] for pose in poses]).max(initial=0.0)
+    beside = math.inf
+    if preset.window is not None:  # a window shows few of the objects
+        beside = _BESIDE * diameter * focal_length(composition.K)
     for _ in range(_TRIALS):
         T_cam_table = draw_view(table, composition)
         turn = rotation_vector_to_matrix(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))
         shift = np.array([*rng.uniform(-pile.aside, pile.aside, 2) * reach, 0.0])
         T_cam_pile = T_cam_table @ make_transform(turn, shift)
-        objects = []
+        objects: list[SceneObject] = []
         for body, pose, material in zip(bodies, poses, materials, strict=True):
             T_cam_obj = T_cam_pile @ pose
             hull = transform(T_cam_obj, body.surface.hull)
@@ -80,9 +82,11 @@ def arrange_heap(
                 break
             image = project(hull, composition.K)
             lower, upper = image.min(axis=0), image.max(axis=0)
-            in_view = (upper > -0.5).all() and (lower < np.array(composition.size) - 0.5).all()
+            outside = np.max([-0.5 - upper, lower - np.array(composition.size) + 0.5])  # pixels
+            if outside > beside / hull[:, 2].min():
+                continue
             # A part below two pixels is not recognisable.
-            part = body.part if in_view and (upper - lower).max() >= 2.0 else None
+            part = body.part if outside < 0 and (upper - lower).max() >= 2.0 else None
             objects.append(SceneObject(body.surface, T_cam_obj, material, part))
         else:
             if not targets or any(item.is_target for item in objects):

@@ -83,9 +83,11 @@ def settle(
         UserError: The cached result is damaged.
     """
     digest = hashlib.sha256(Path(__file__).read_bytes() + mujoco.__version__.encode())
-    pieces = [piece for solid in solids for piece in solid]
-    counts = np.array([len(solid) for solid in solids])
-    for array in (*pieces, *walls, starts, counts, np.array([len(walls), diameter])):
+    distinct = {id(solid): solid for solid in solids}  # most solids are copies of one part
+    pieces = [piece for solid in distinct.values() for piece in solid]
+    counts = np.array([len(solid) for solid in distinct.values()])
+    kinds = np.array([list(distinct).index(id(solid)) for solid in solids])
+    for array in (*pieces, *walls, starts, counts, kinds, np.array([len(walls), diameter])):
         digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
     path = cache_folder() / "piles" / f"{digest.hexdigest()[:24]}.npy"
     if path.is_file():

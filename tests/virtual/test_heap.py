@@ -8,7 +8,7 @@ import pytest
 import dopepp.core.errors
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, transform
-from dopepp.virtual import Factory, visible_fractions
+from dopepp.virtual import Factory, heap, visible_fractions
 from dopepp.virtual.presets import Preset, preset_of
 from dopepp.virtual.presets.table import Pile
 from dopepp.virtual.renderers import find_renderer
@@ -167,6 +167,21 @@ def test_a_window_shows_a_heap_and_labels_only_parts_in_view(box_part):
         assert scene.targets
         inside = np.array([item.is_target for item in scene.objects])
         assert not visible_fractions(scene)[~inside].any() or (~inside).sum() <= 1  # the bin
+
+
+def test_a_window_omits_only_objects_that_are_far_beside_it(box_part, monkeypatch):
+    view = replace(small(targets_per_image=[25, 25]).resized(640, 480), window=(64, 64))
+    some = [Factory([box_part], view, 3).scene(0, index).objects for index in range(4)]
+    monkeypatch.setattr(heap, "_BESIDE", np.inf)
+    scenes = [Factory([box_part], view, 3).scene(0, index) for index in range(4)]
+    assert sum(map(len, some)) < sum(len(scene.objects) for scene in scenes)
+    for kept, scene in zip(some, scenes, strict=True):
+        poses = {item.T_cam_obj.tobytes() for item in kept}
+        shown = find_renderer("raster")(scene).instances
+        for number, item in enumerate(scene.objects):
+            if item.T_cam_obj.tobytes() not in poses:
+                assert not item.is_target
+                assert not (shown == number).any()
 
 
 def test_both_renderers_draw_a_heap(heaps):

@@ -61,11 +61,17 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
 
 def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
     """Load the parts that renders show unlabelled: ``virtual.negatives``, other models of BOP."""
-    listed = [load_part(name, data.unit) for name in data.virtual.negatives]
+    listed = [_negative(name, data.unit) for name in data.virtual.negatives]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
     hashes = {part.mesh_hash for part in (*parts, *listed)}
     return listed + [part for part in _all_models(data.root) if part.mesh_hash not in hashes]
+
+
+@lru_cache(maxsize=16)
+def _negative(name: str, unit: str | None) -> Part:
+    """Load a part, once per process, so that messages about its mesh appear once."""
+    return load_part(name, unit)
 
 
 @lru_cache(maxsize=1)

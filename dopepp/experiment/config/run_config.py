@@ -190,9 +190,9 @@ class FalsePositiveTarget:
     """Permitted rate of false positives on camera frames without objects.
 
     Attributes:
-        num_empty: Number of frames without objects to choose the threshold, and of further frames
-            to check the threshold (:mod:`dopepp.experiment.assembly.negative_frames`).
-        false_positive_rate: Permitted share of these frames with a detection; with 1 every
+        num_empty: Number of frames without objects that choose the threshold, and of further ones
+            that check it (:mod:`dopepp.experiment.assembly.negative_frames`).
+        false_positive_rate: Largest share of these frames that may show a detection; with 1, every
             candidate is reported.
     """
 

@@ -159,7 +159,7 @@ class PaperTable:
 
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
-    """Print the table; write ``table.md``, ``table.csv`` and, for shading and time, a figure."""
+    """Print a table and write ``table.md`` and ``table.csv``; for Tables 3 and 8, also a figure."""
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
     if table.kind not in _MEASURED:  # refinement does not affect the cost of a network
         entries = [entry for entry in entries if not entry.refine]

@@ -167,14 +167,18 @@ def tune(
     validation, test = (cache.of(held_out_source(data, parts, split)) for split in HELD_OUT)
     empty, empty_test = (cache.of(negative_frames(data, parts, split, count)) for split in HELD_OUT)
     plain = _without_refinement(estimator)
+    _log.info("tuning: measuring on %d test images and %d without objects", len(test), count)
     before = _measured(plain, parts, test, empty_test, old)
+    _log.info("tuning: fitting factors and scores on %d validation images", len(validation))
     new, shown, kept = _chosen_factors(estimator, parts, validation, empty, rate, old)
     if estimator.refiner is not None and estimator.refiner.verifies:
         estimator.recovery = _without_thresholds(new)
+        _log.info("tuning: fitting the score and covariances of refined poses")
         without = score_images(estimator, parts, empty)
         factor = fit_refined_factor(estimator, parts, WrongFocalLengths(validation))
         new = replace(new, **choose(shown, without, rate, refined=True))  # type: ignore[arg-type]
         new = replace(new, refined_covariance_factor=factor)
+    _log.info("tuning: measuring with the new options")
     after = _measured(estimator, parts, test, empty_test, new)
     options = {
         field.name: getattr(new, field.name)

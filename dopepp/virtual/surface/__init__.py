@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh import Faces, Points, Vertices, connected
+from dopepp.parts.mesh import Faces, Points, Vertices, connected, largest_distance
 from dopepp.parts.mesh.read import find_topology
 from dopepp.parts.part import Mesh
 from dopepp.virtual.sensor import SRGB_TO_LINEAR
@@ -67,6 +68,11 @@ class Surface:
     def radius(self) -> float:
         """Largest distance of a vertex from the object frame's origin, metres."""
         return float(np.linalg.norm(self.hull, axis=1).max())
+
+    @cached_property
+    def diameter(self) -> float:
+        """Largest distance between two vertices, metres."""
+        return largest_distance(self.hull)
 
     def scaled(self, scale: Vector) -> Surface:
         """Return the surface stretched along the object's x, y and z by positive factors.

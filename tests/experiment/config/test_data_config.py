@@ -118,3 +118,19 @@ def test_seen_on_selects_preset_and_rotations(seen_on, preset, turning, parsed):
     scenes = parsed("experiment=my_part", *chosen).data.preset
     assert (scenes.name, scenes.turning.kind) == (preset, turning)
     assert (scenes.table is not None) == (preset != "wide")
+
+
+@pytest.mark.parametrize(
+    ("materials", "metal", "prints"),
+    [("mixed", None, None), ("metal", 0.8, None), ("plastic", 0.0, 0.0), ("print", 0.0, 1.0)],
+)
+@pytest.mark.parametrize("seen_on", ["front", "bin"])
+def test_materials_changes_the_shares_of_metal_and_prints(
+    seen_on, materials, metal, prints, parsed
+):
+    options = ("experiment=my_part", f"seen_on={seen_on}")
+    mixture = parsed(*options).data.preset.materials
+    expected = {"metal_share": metal, "print_share": prints}
+    expected = {name: share for name, share in expected.items() if share is not None}
+    chosen = parsed(*options, f"materials={materials}").data.preset.materials
+    assert chosen == replace(mixture, **expected)

@@ -240,7 +240,10 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> ModelSizes | None
 
 
 def _model(node: Node, record: object, stated: float) -> ModelSize:
-    """Check diameter and box in a record of ``models_info.json``; return the plausible values."""
+    """Check a model's record in ``models_info.json``; return its size without implausible values.
+
+    ``stated`` is the diameter in the record, metres; NaN if it is missing.
+    """
     fields, diameter = mapping(record), None if np.isnan(stated) else stated
     if fields and "diameter" not in fields:
         node["diameter"].report("missing")

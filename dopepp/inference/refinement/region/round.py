@@ -252,7 +252,10 @@ class Round:
         return float(np.linalg.slogdet(before + added)[1] - np.linalg.slogdet(before)[1])
 
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
-        """Measure the shifts of a contour within a search distance, pixels of the image."""
+        """Measure where the part ends along the normals of a contour, at most ``reach`` away.
+
+        ``reach`` is in pixels of the image.
+        """
         reach, odds, colours = self.reach(reach), self._smooth_odds, self.crop.colours
         return find_shifts(odds, colours, contour, reach, _step(reach), self._weights)
 

@@ -108,7 +108,11 @@ def _mesh(mi: Any, item: SceneObject, reflectance: Any) -> Any:
 
 
 def _corner_uv(surface: Surface) -> Float[np.ndarray, "corners 2"]:
-    """Return (u, v down) or, without a texture, metres along the axes most parallel to the face."""
+    """Return each corner's texture coordinates; without a texture, its two coordinates in metres.
+
+    The texture's v axis points down. Of the three coordinates, the one closest to the direction of
+    the face's normal is omitted.
+    """
     if len(surface.uv):
         uv = surface.uv[surface.faces].reshape(-1, 2)
         return np.asarray(np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1))

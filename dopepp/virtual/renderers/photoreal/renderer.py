@@ -109,7 +109,7 @@ def _objects_window(scene: Scene) -> Box | None:
 
 
 class Tracer:
-    """Path tracing of a scene with objects by Mitsuba.
+    """Path tracing of a scene by Mitsuba.
 
     Attributes:
         world: Mitsuba's description of the objects.
