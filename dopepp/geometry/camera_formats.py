@@ -232,7 +232,7 @@ def _numbers(name: str, value: object) -> list[float]:
 
 
 def _number(name: str, value: Any) -> float:
-    """Return a finite number, or the finite number in a text."""
+    """Convert a number or string to a finite float."""
     numbers = None if isinstance(value, bool) else _floats([value])
     if numbers is None:
         problem = f"{name}={short_repr(value, 80)}"
@@ -241,7 +241,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _floats(values: Sequence[Any]) -> list[float] | None:
-    """Convert numbers or texts to finite floats; None if that is impossible."""
+    """Convert numbers or strings to finite floats; return None if that is impossible."""
     try:
         numbers = [float(value) for value in values]
     except (TypeError, ValueError, OverflowError):

@@ -130,8 +130,8 @@ def _prepare(
 ) -> tuple[Rays, Whitenings, Bool[np.ndarray, "n"]]:
     """Return rays and pixel whitenings of the usable points, and the mask of the usable points.
 
-    Usable are finite points within ``MAX_TANGENT`` of the axis whose covariance Σ is positive
-    definite. A whitening W of Σ has WᵀW = Σ⁻¹.
+    A point is usable if it is finite, its ray is within ``MAX_TANGENT`` of the optical axis, and
+    its covariance Σ is positive definite. A whitening W of Σ has WᵀW = Σ⁻¹.
     """
     # Inputs may be any number and squares may overflow, so the results are checked. W is the
     # inverse of Cholesky's L with Σ = LLᵀ.

@@ -375,7 +375,7 @@ class PoseEstimator:
         camera: Camera | Path | str | None = None,
         **options: Unpack[StreamOptions],
     ) -> Iterator[PoseResult]:
-        """Detect the parts on every frame of a source; see :func:`dopepp.inference.stream.stream`.
+        """Detect the parts in every frame of a source; see :func:`dopepp.inference.stream.stream`.
 
         Args:
             source: Path (image, folder, video, ROS recording), glob pattern, camera number or URL.

@@ -322,7 +322,7 @@ def _depths(
 
 
 def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Sequence[float]:
-    """Return the smallest set of scales at which a part has a trained size at all depths.
+    """Return the smallest set of scales at which a part has a size seen in training at all depths.
 
     ``reach`` is the part's length on the image at a depth of one metre, pixels. At the middle depth
     of a scale's range, the part has the middle size.

@@ -1,4 +1,4 @@
-"""PoseResult: the detections on one frame, which can be drawn, saved and exported.
+"""PoseResult: the detections in one frame, which can be drawn, saved and exported.
 
 All poses are in the camera frame (:data:`FRAME`), which every output states. Silhouettes are drawn
 from the part's mesh: at a correct pose, they coincide with the part's outline on the image.
@@ -96,7 +96,7 @@ def make_shape(part: Part) -> Shape:
 
 @dataclass(frozen=True, eq=False)
 class PoseResult:
-    """Detections on one frame, with its image and camera matrix."""
+    """Detections in one frame, with its image and camera matrix."""
 
     image: RGBImage = field(repr=False)  # RGB, without lens distortion: keypoints and K refer to it
     K: CameraMatrix  # camera matrix, pixels

@@ -1,4 +1,4 @@
-"""Estimation of poses on every frame of an image file, video, camera or recording."""
+"""Estimation of poses in every frame of an image file, video, camera or recording."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def stream(
     camera: Camera | Path | str | None = None,
     **options: Unpack[StreamOptions],
 ) -> Iterator[PoseResult]:
-    """Yield the detections on each frame of a source as soon as they are estimated.
+    """Yield the detections in each frame of a source as soon as they are estimated.
 
     Frames of a camera or network stream that arrive while the estimator is busy are dropped: each
     result belongs to the newest frame. Files are read to their end, cameras without end.
@@ -87,7 +87,7 @@ def _process(
     lens: Lens,
     options: StreamOptions,
 ) -> PoseResult:
-    """Detect or track the parts on one frame."""
+    """Detect or track the parts in one frame."""
     before, start = dict(estimator.spent_ms), time.perf_counter()
     image, K = lens.undistort(frame.image)
     estimator.spent_ms["pre"] += 1000 * (time.perf_counter() - start)

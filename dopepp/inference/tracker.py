@@ -141,7 +141,7 @@ def at_rest(T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motio
 
 @dataclass(frozen=True)
 class Track:
-    """Pose and velocity of a tracked part on one frame."""
+    """Pose and velocity of a tracked part in one frame."""
 
     identity: int  # number of the instance, kept while the part is tracked or lost
     detection: Detection  # this frame's pose, with score and peaks of the network's last run
@@ -188,7 +188,7 @@ class PoseTracker:
 
     def __init__(self, estimator: PoseEstimator, detect_every: int = 30) -> None:
         if estimator.refiner is None:
-            problem = "a tracker of an estimator that does not refine"
+            problem = "a tracker for an estimator without refinement"
             fix = "load it with PoseEstimator.load(path, refine='region')"
             raise UserError(problem, "refine='region'", fix)
         self.detect_every = check("detect_every", detect_every, int, Range(1, 1_000_000))

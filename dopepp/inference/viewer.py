@@ -99,7 +99,7 @@ class Viewer:
         log("summary", rr.TextDocument(result.summary))
         for name, belief in belief_images(self._estimator, result).items():
             log(f"beliefs/{name}", rr.Image(belief))
-        # With a tracker, a detection has the same name on every frame.
+        # With a tracker, a detection has the same name in every frame.
         numbers = result.identities or range(len(result.detections))
         pairs = zip(result.detections, numbers, strict=True)
         named = {f"{detection.object}_{k}": detection for detection, k in pairs}

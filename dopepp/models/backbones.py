@@ -82,7 +82,7 @@ class VGG19(_Chain):
     """DOPE's backbone: VGG19's layers 0–22, then 3×3 convolutions 512→256 and 256→128.
 
     Args:
-        width: Factor on every channel count (DOPE: 1).
+        width: Multiplier of every channel count (DOPE: 1).
         batch_norm: Whether batch norm replaces the bias of every convolution.
         weights_path: File with a ``state_dict`` of torchvision's ``vgg19`` that initialises the VGG
             layers. Checkpoints do not store this path.
@@ -161,7 +161,7 @@ class Pyramid(Backbone):
         channels: Channels at strides 4, 8, 16 and 32, each 8–1024.
         blocks: Number of residual blocks at these strides, each 1–16.
         top_down: Number of residual blocks after the sums at strides 16 and 8, each 0–16.
-        width: Factor on every channel count.
+        width: Multiplier of every channel count.
     """
 
     cell_multiple = 4

@@ -51,7 +51,7 @@ class EfficientNetLite(Backbone):
     Args:
         channels: Channels of the sums, 8–1024.
         top_down: Number of residual blocks after the sums at strides 16 and 8, each 0–16.
-        width: Factor on ``channels``; the encoder's channels are fixed.
+        width: Multiplier of ``channels``; the encoder's channels are fixed.
         frozen: Stride down to which the encoder is frozen, 8, 16 or 32; 0 freezes no layer.
         weights_path: File with a ``state_dict`` in EfficientNet-PyTorch's names that initialises
             the encoder, or ``imagenet`` for the ImageNet weights that the extra ``imagenet``

@@ -62,7 +62,7 @@ class Watch(threading.Thread):
         self._stopped.set()
 
     def death(self, wait_s: float = 0.0) -> str | None:
-        """Wait up to ``wait_s`` seconds for the death of a process; describe it, or return None."""
+        """Wait up to ``wait_s`` seconds for a process to die; return how it died, or None."""
         deadline = time.monotonic() + wait_s
         while True:
             for rank, child in enumerate(self._children, start=1):

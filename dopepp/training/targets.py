@@ -247,8 +247,8 @@ def _best_axis_rotation(
 ) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation C about an axis for which offset·C is nearest to the identity.
 
-    tr(A·C(θ)) = aᵀAa + cos θ·(tr A − aᵀAa) + sin θ·tr(A·[a]×) is largest at the angle of the two
-    factors. An axis of zeros means no continuous symmetry; then C is the identity.
+    For A = offset and axis a, tr(A·C(θ)) = aᵀAa + c·cos θ + s·sin θ, with c = tr A − aᵀAa and
+    s = tr(A·[a]×), is largest at θ = atan2(s, c). A zero axis (no symmetry) gives the identity.
     """
     x, y, z = axes.unbind(-1)
     zero = torch.zeros_like(x)

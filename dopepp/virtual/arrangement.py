@@ -185,7 +185,7 @@ def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:
-    """Try up to eight times to add a distractor that neither pierces nor hides a target.
+    """Try up to eight times to add a distractor that neither intersects nor hides a target.
 
     The preset's range of distractor depths is multiplied by the depth ``reference``, metres.
     """

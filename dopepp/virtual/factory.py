@@ -175,7 +175,7 @@ class Factory:
 
 
 def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
-    """Return the shift of the world, camera frame, metres, that magnifies the targets.
+    """Return the shift of the world that magnifies the targets, in metres in the camera frame.
 
     The shift divides the distance of the targets' mean centre from the camera by ``scale``, a
     positive number. Without targets, the shift is zero.

@@ -127,7 +127,7 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
             f"{path}, which is not a JSON object",
             "a file written by `dopepp render`",
         )
-        raise UserError(problem, allowed, "restore the file from a copy, or choose another folder")
+        raise UserError(problem, allowed, "restore the file from backup, or choose another folder")
     return content
 
 

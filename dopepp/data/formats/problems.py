@@ -209,7 +209,7 @@ class Node:
         return np.full(shape, np.nan)
 
     def scalar(self, value: object) -> float:
-        """Return a field's number; report another value and return NaN."""
+        """Return a field's number; report any other value and return NaN."""
         return float(self.numbers(value, 1)[0])
 
     def entries(self, value: object) -> list[Any]:

@@ -93,7 +93,7 @@ def check_resume(
     path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
     if not isinstance(before, Mapping):
-        fix = "restore the file from a copy, or start a new run"
+        fix = "restore the file from backup, or start a new run"
         raise UserError(
             f"{path}, which contains a {type(before).__name__}", "a mapping of options", fix
         )
@@ -154,14 +154,14 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
         UserError: The stored value is not a list of overrides.
     """
     if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
-        fix = "restore the file from a copy, or start a new run"
+        fix = "restore the file from backup, or start a new run"
         raise UserError(f"{source} without a list of overrides", "key=value lines", fix)
     kept = []
     for text in stored:
         match = _OVERRIDE.fullmatch(text)
         if match is None:
             problem, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
-            fix = "restore the file from a copy, or start a new run"
+            fix = "restore the file from backup, or start a new run"
             raise UserError(problem, allowed, fix)
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue

@@ -268,9 +268,9 @@ class WrongFocalLengths:
     """Images of a source with simulated calibration errors of the camera matrix.
 
     The relative error of the focal length is uniformly distributed up to the scale error that
-    refinement assumes. With exact cameras, covariances would be fitted to errors that no real
-    camera reaches. The principal point moves too, so that the line of sight to the first object is
-    unchanged. The error then changes only the object's distance, like an error of its size.
+    refinement assumes. With exact cameras, covariances would be fitted to errors smaller than those
+    of any real camera. The principal point moves too, so that the line of sight to the first object
+    is unchanged. The error then changes only the object's distance, like an error of its size.
     """
 
     def __init__(self, source: SampleSource) -> None:

@@ -155,7 +155,7 @@ def camera(case: Case) -> Diagnosis:
         return Diagnosis("camera", f"{sentence}, but {other}", fix)
     ratio = _lens_ratio(case)
     if ratio is not None:
-        other = f"{name} has a trained size and, by K, {ratio:.2g} times the trained distance"
+        other = f"{name} is as large as in training, but K puts it {ratio:.2g} times as far away"
         same = f"none if the focal length is {ratio:.2g} times the training focal length"
         fix = f"{same}; otherwise {fix}"
         return Diagnosis("camera", f"{sentence}; {other}", fix)
@@ -235,7 +235,7 @@ def pose(case: Case) -> Diagnosis:
         return Diagnosis("pose", "no pose to check")
     detection, refined, name = case.detection, case.refined, case.part.name
     share = detection.reprojection_error_px / case.length_px
-    sentence = f"{name}'s keypoints are {detection.reprojection_error_px:.1f} pixels off it"
+    sentence = f"{name} has a reprojection error of {detection.reprojection_error_px:.1f} pixels"
     if not case.estimator.has_network:
         sentence = f"{name} is {case.length_px:.0f} pixels long"
     if share > OFF:

@@ -234,7 +234,7 @@ def count_records(records: Sequence[Record]) -> Counts:
 
 
 def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Group records by name of their pose source, and sort each group by number of the trial."""
+    """Group records by pose source, and sort each group by trial number."""
     groups: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda record: record.number):
         groups.setdefault(record.source, []).append(record)

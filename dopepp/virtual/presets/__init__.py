@@ -124,7 +124,7 @@ class Preset(Checked):
         return crop_camera(K, *corner), self.window
 
     def resized(self, width: int, height: int) -> Preset:
-        """Return the preset for another image size; another aspect ratio stretches images."""
+        """Return the preset for another image size; a different aspect ratio stretches images."""
         K = resize_camera(self.K, width / self.width, height / self.height)
         return self._with_camera(K, width, height, width / self.width)
 

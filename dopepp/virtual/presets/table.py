@@ -22,16 +22,16 @@ from dopepp.virtual.scene import Plane, triple
 
 @dataclass(frozen=True)
 class Pile(Checked):
-    """Heaps of objects dropped by physics (extra ``robot``), without limits on their visibility.
+    """Heaps of objects dropped in a physics simulation (extra ``robot``), with any visibility.
 
     Attributes:
         piles: Number of different heaps in every 10,000 images; heaps are cached on disk.
         mixed_share: Probability that a heap has all kinds of targets; other heaps have one kind.
         bin_share: Probability that a heap lies in a bin and not on the open table.
-        room: Side of the square bin or drop area over the objects' mean size (cube root of the
-            bounding box's volume) and over the square root of their number.
-        wall_height: Height of the bin's walls, diameters of the largest target.
-        aside: Largest distance of the optical axis from the heap's middle, heap radii.
+        room: Side of the square bin or drop area, divided by the objects' mean size (cube root of
+            the bounding box's volume) and by the square root of their number.
+        wall_height: Height of the bin's walls, in diameters of the largest target.
+        aside: Largest distance of the optical axis from the heap's middle, in heap radii.
     """
 
     piles: Annotated[int, Range(1, 10_000, "a count")] = 200
@@ -59,7 +59,7 @@ class Table(Checked):
         heaped: Whether objects are lowered onto a heap instead of lying side by side.
         heap_radius: Radius within which a heap's objects are lowered, diameters of the largest
             target.
-        pile: Heaps dropped by physics, in place of single objects; None for no physics.
+        pile: Heaps dropped in a physics simulation, instead of single objects; None for no physics.
         picture_width: Width on the plane that one background image covers, camera distances;
             outside, the image is mirrored.
     """

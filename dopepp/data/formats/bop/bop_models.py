@@ -252,7 +252,7 @@ def _continuous(
 
 
 def _rows(node: Node, value: object) -> list[Any]:
-    """Return a list of symmetries; report another value or an overlong list and return []."""
+    """Return a list of symmetries; report any other value or an overlong list and return []."""
     if value is None or (isinstance(value, list) and len(value) <= MAX_SYMMETRIES):
         return value or []
     node.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")

@@ -126,7 +126,7 @@ class WebdatasetReader:
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Return one entry: hashes of members and meshes, and the visible fractions' origin."""
+        """Return one entry: hashes of members and meshes, and the source of visible fractions."""
         digest, has_infos = hashlib.sha256(), True
         for shard, row in self._items:
             digest.update(shard.keys[row].encode())

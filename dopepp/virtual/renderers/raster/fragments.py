@@ -31,11 +31,11 @@ class Fragments(NamedTuple):
         face: Index of the triangle, or the bitwise complement for a back face, shape (n,).
         x: Mean column of the samples in the image, shape (n,); ``y`` is the mean row.
         inverse: Inverse depth of a sample, 1/m, shape (n,).
-        share: Weights of the triangle's corners, shape (3, n).
+        share: Barycentric weights of the triangle's corners, shape (3, n).
         position: Camera frame, metres, shape (3, n).
         normal: Unit normal towards the camera, camera frame, shape (3, n).
         albedo: Linear RGB, shape (3, n).
-        bulge: Height of the smooth surface over the flat triangle, metres, shape (n,).
+        bulge: Height of the smooth surface above the flat triangle, metres, shape (n,).
         alpha: Width of the GGX lobe, shape (n,).
     """
 
