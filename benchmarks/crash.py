@@ -1,4 +1,4 @@
-"""Kill a training at random moments, resume it, and compare it with an uninterrupted training.
+"""Kill a training run at random moments, resume it, and compare it with an uninterrupted run.
 
     python benchmarks/crash.py --kills 50
 

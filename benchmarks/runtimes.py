@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def config_of(model: str, *overrides: str):
-    """Return the config of a training of a model on renders of one part."""
+    """Return a config for training a model on renders of one part."""
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 

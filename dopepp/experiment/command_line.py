@@ -30,7 +30,7 @@ SHORT_NAMES: Final = {
 }
 """Full option name by short name, for ``train.py``."""
 EVALUATION_SHORT_NAMES: Final = {**SHORT_NAMES, "scale": "scale_factors"}
-"""Short names for ``evaluate.py``. In a training, ``scale`` selects a file of ``conf/scale``."""
+"""Short names for ``evaluate.py``. For training, ``scale`` selects a file of ``conf/scale``."""
 
 
 def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words: int) -> None:

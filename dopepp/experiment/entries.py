@@ -140,7 +140,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     results.
 
     Returns:
-        In a multirun, the validation score of a training's best checkpoint, else None.
+        In a multirun, the validation score of the run's best checkpoint, else None.
     """
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)

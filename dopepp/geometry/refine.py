@@ -240,7 +240,7 @@ def solve_inside(
 
 @compiled()
 def apply_rotation(step: Array, R: Array, out: Array) -> None:
-    """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step."""
+    """Write Exp(ω) R into ``out``; ω, a rotation vector, is the first three numbers of a step."""
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)
     a, b = 1.0, 0.5

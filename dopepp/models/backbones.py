@@ -41,7 +41,7 @@ class Backbone(nn.Module, ABC):
     Attributes:
         out_channels: Channels of the feature maps.
         stride: Input pixels per feature cell, along each axis.
-        cell_multiple: Number of which the feature map's height and width must be multiples.
+        cell_multiple: The feature map's height and width must be multiples of this number.
     """
 
     out_channels: int

@@ -66,7 +66,7 @@ class Head(nn.Module):
         make_branch: Builds a branch from input channels, output channels and stage (from 0).
 
     Attributes:
-        cell_multiple: Number of which the feature map's height and width must be multiples.
+        cell_multiple: The feature map's height and width must be multiples of this number.
     """
 
     cell_multiple: int = 1

@@ -89,8 +89,8 @@ def initialise(module: nn.Module) -> None:
     """Sample convolution and linear weights from He's normal distribution; set biases to 0.
 
     The variance 2 / fan_in (He et al. 2015, Eq. 10) preserves the scale of activations in networks
-    without batch norm that are as deep as DOPE's cascade. Weights on ``meta`` are skipped, because
-    drawing them would import PyTorch's compiler.
+    without batch norm that are as deep as DOPE's cascade. Weights on the meta device are skipped,
+    because sampling them would import PyTorch's compiler.
     """
     for layer in module.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)) and not layer.weight.is_meta:

@@ -42,7 +42,7 @@ class PoseNetwork(nn.Module):
 
     Attributes:
         stride: Pixels per map cell.
-        size_multiple: Number of which the image's height and width must be multiples.
+        size_multiple: The image's height and width must be multiples of this number.
     """
 
     mean: Tensor

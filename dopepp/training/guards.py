@@ -273,7 +273,7 @@ class EmptyMaps(Callback):
         _log.warning("\n".join(lines))
 
     def _early(self, trainer: Trainer, system: PoseSystem) -> str:
-        """Return advice for a training that has run too few steps."""
+        """Return advice for a training run with too few steps."""
         text = f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
         text += "train longer (trainer.max_epochs)"
         if isinstance(system.loss, MapMSE):

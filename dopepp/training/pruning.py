@@ -1,4 +1,4 @@
-"""Reports of a training to a hyperparameter study, and pruning of poor trials.
+"""Reports of a training run to a hyperparameter study, and pruning of poor trials.
 
 The study is a database to which all trials write, also from other machines. A study's objective is
 the value that selects the best checkpoint.

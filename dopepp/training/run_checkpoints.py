@@ -219,7 +219,7 @@ def _read_intact(path: Path) -> tuple[Checkpoint, int]:
     missing = sorted(_NEEDED - content.keys())
     if bad is not None or missing:
         problem = f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}"
-        raise UserError(problem, "an intact checkpoint of a training", "use another checkpoint")
+        raise UserError(problem, "an intact training checkpoint", "use another checkpoint")
     return checkpoint, int(content["global_step"])
 
 

@@ -1,4 +1,4 @@
-"""Throughput, remaining time and profiles of a training.
+"""Throughput, remaining time and profiles of a training run.
 
 To add a profiler, write a subclass of Lightning's ``Profiler`` and add a line to
 :func:`make_profiler` and to :func:`profile_rows`.

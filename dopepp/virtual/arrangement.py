@@ -103,9 +103,9 @@ class Preview:
         self._needed: list[float] = []
 
     def add(self, item: SceneObject) -> bool:
-        """Add an object, and return True, if each target then keeps the smallest visible fraction.
+        """Add an object, and return True, if each target keeps its minimum visible fraction.
 
-        An object that reaches the camera or spans over four image sides is not added.
+        An object that reaches the camera or is over four times as long as the image is rejected.
         """
         projected, (width, height) = project_object(item, self._K), self._size
         left, top, right, bottom = projected.extent

@@ -234,7 +234,7 @@ def _collect_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Pa
         if part.name in names or part.mesh_hash in hashes:
             raise UserError(
                 f"negative {part.name}, which is one of the targets {', '.join(sorted(names))}",
-                "parts whose names and meshes differ from the names and meshes of the targets",
+                "parts that share neither name nor mesh with a target",
                 f"leave {part.name} out of the negatives",
             )
     names |= {part.name for part in given}

@@ -166,10 +166,10 @@ class Scene:
         return tuple(i for i, item in enumerate(self.objects) if item.is_target)
 
     def seen_from(self, T_new_cam: Transform) -> Scene:
-        """Return the static scene in another camera with the same lens and sensor.
+        """Return the static scene as seen by another camera with the same lens and sensor.
 
-        The background is warped as the plane's image or, without a plane, as an infinitely distant
-        image; pixels that it does not cover are filled by reflection at its border.
+        The background is warped by the plane's homography or, without a plane, by rotation only.
+        Pixels outside the old image are filled by reflection at its border.
 
         Args:
             T_new_cam: Transform from this camera to the other, metres.

@@ -182,7 +182,7 @@ class HeightMap:
     def footprint(
         self, surface: Surface, rotation: RotationMatrix, lowest: float
     ) -> Footprint | None:
-        """Return the footprint of a rotated object, or None if it spans over 1024 cells.
+        """Return the footprint of a rotated object, or None if it is longer than 1024 cells.
 
         ``lowest`` is the height of the object's lowest point relative to its origin, metres.
         """

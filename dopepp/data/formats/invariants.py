@@ -102,7 +102,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
         return True
     node["unit"].report(
         f"{distance:.3g} diameters ({diameter:.4g}) from the camera; {least:g} … {most:g} allowed: "
-        "is one of the two in another unit (mm, m)?"
+        "is the position or the diameter in another unit (mm, m)?"
     )
     return False
 

@@ -207,9 +207,9 @@ class RandomMask(Checked):
     def _crop(
         self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
     ) -> RGBImage | None:
-        """Return a random crop of the image's background of at most (height, width).
+        """Return a random crop of the image's background, at most (height, width) in size.
 
-        Without such a crop, return a crop with contrast from ``other``, or None.
+        If there is none, try ``max_draws`` crops from ``other``; None if none has enough contrast.
         """
         crop = crops.largest(size, rng)
         if crop is not None:

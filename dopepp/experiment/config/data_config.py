@@ -1,6 +1,6 @@
 """The config nodes ``data`` (images) and ``virtual`` (renders).
 
-The config of a training contains both nodes. An evaluation reads both nodes from its checkpoint and
+The config of a training run has both nodes. An evaluation reads both nodes from its checkpoint and
 applies the user's changes.
 """
 

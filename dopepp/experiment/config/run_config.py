@@ -162,7 +162,7 @@ class CostConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRateConfig:
-    """Options of ``job=lr_finder``, a training whose learning rate grows from step to step.
+    """Options of ``job=lr_finder``, training with a learning rate that grows from step to step.
 
     Attributes:
         min_lr: Learning rate of the first step.
@@ -262,7 +262,7 @@ def _quantities(given: object) -> tuple[QuantityName, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementConfig(FalsePositiveTarget):
-    """Options that a training and an evaluation share.
+    """Options that training and evaluation share.
 
     Attributes:
         plain: The whole config as nested dictionaries and lists, as printed and stored.

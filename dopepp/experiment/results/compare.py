@@ -129,7 +129,7 @@ def compare_paths(
     """Compare run folders and return the folder with the comparison.
 
     Args:
-        paths: Folders of trainings, evaluations and multiruns.
+        paths: Folders of training runs, evaluations and multiruns.
         out: New folder (default: a folder below ``outputs/compare``).
         baseline: Method that Δ refers to (default: ``dope``, else the first method).
         num_pictures: Number of test images on which every model predicts.

@@ -1,7 +1,7 @@
 """Read run folders and group the runs into methods.
 
-A method is one or more trainings that differ only in seed or object. Trainings, evaluations and
-multiruns are read, including failed and unfinished runs.
+A method is one or more training runs that differ only in seed or object. Training runs, evaluations
+and multiruns are read, including failed and unfinished runs.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class Entry:
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
-    """Read the runs in folders of trainings, evaluations and multiruns, each folder once.
+    """Read the runs in folders of training runs, evaluations and multiruns, each folder once.
 
     Raises:
         UserError: A path holds no run.
@@ -148,7 +148,7 @@ def _folders(path: Path) -> list[Path]:
     if not jobs:
         raise UserError(
             f"{path}, which holds no run",
-            "the folder of a training, an evaluation or a multirun",
+            "the folder of a training run, an evaluation or a multirun",
             "pass a folder with metrics.json or config.yaml in it",
         )
     return sorted(jobs, key=lambda job: int(job.name))
@@ -165,7 +165,7 @@ def read_run(folder: Path) -> Run:
     if run.report is not None and "checkpoint" in run.report.details:
         run.checkpoint = folder / str(run.report.details["checkpoint"])
     training, configs = config, [_without_automatic_sizes(folder, config)] if config else []
-    if "ckpt_path" in config:  # an evaluation: its checkpoint belongs to a training
+    if "ckpt_path" in config:  # an evaluation: its checkpoint belongs to a training run
         run.checkpoint = Path(str(config["ckpt_path"]))
         trained = run.checkpoint.parent.parent
         training = _mapping(trained / CONFIG_FILE)

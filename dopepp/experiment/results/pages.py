@@ -113,7 +113,7 @@ def write_page(path: Path, template: str, **content: object) -> None:
 
 
 class RunReadme:
-    """README of a training.
+    """README of a training run.
 
     Nothing is written before :meth:`begin`, so a run that cannot begin leaves its folder unchanged.
     A run continues if its README cannot be written.
@@ -171,7 +171,7 @@ def write_run_readme(
     next_commands: Sequence[str] = (),
     is_trial: bool = False,
 ) -> None:
-    """Write the README of a training, an evaluation or another job.
+    """Write the README of a training run, an evaluation or another job.
 
     Args:
         folder: Run folder.

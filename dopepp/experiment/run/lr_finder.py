@@ -101,7 +101,7 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
 
 
 def _short_training(config: RunConfig) -> RunConfig:
-    """Return the config of a training on one device without schedule, validation and callbacks."""
+    """Return a config for training on one device without schedule, validation and callbacks."""
     trainer = replace(
         config.trainer,
         max_steps=-1,

@@ -114,7 +114,7 @@ def launch(
 
 
 def on_joblib(n_jobs: int) -> Runner:
-    """Return a runner of ``n_jobs`` parallel processes on this machine."""
+    """Return a runner with ``n_jobs`` parallel processes on this machine."""
     check("hydra.launcher.n_jobs", n_jobs, int, Range(1, _MOST))
     require("joblib", "hydra/launcher=joblib", "joblib")
 
@@ -130,7 +130,7 @@ def on_joblib(n_jobs: int) -> Runner:
 
 
 def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
-    """Return a runner on a Ray cluster.
+    """Return a runner that runs jobs on a Ray cluster.
 
     Args:
         address: ``host:port`` of the cluster; None starts a cluster on this machine.

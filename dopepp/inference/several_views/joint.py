@@ -81,9 +81,9 @@ class JointEstimator:
         self._geometries, self._slope = geometries, slope
 
     def parts(self, clusters: Sequence[Sequence[PartObservation]]) -> list[JointPart]:
-        """Estimate a part from each cluster of observations, without duplicates, best score first.
+        """Estimate one part per cluster of observations, drop duplicates, and sort by score.
 
-        An observation that does not agree with the joint pose of its cluster forms another cluster.
+        Each observation that disagrees with its cluster's joint pose becomes a separate cluster.
         """
         parts: list[JointPart] = []
         waiting = list(clusters)

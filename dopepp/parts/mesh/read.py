@@ -65,7 +65,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
-    """Read a mesh like :func:`read_mesh`, and return also the unit that the file was read in."""
+    """Like :func:`read_mesh`, but also return the unit in which the file was read."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
         fix = "set the unit in which the file was exported, e.g. unit=mm"

@@ -212,7 +212,7 @@ class RasterView:
 
 
 class MujocoView:
-    """View of the bench by MuJoCo's renderer, which needs OpenGL, without random materials."""
+    """View of the bench by MuJoCo's renderer, with fixed materials; requires OpenGL."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         self._cell = Cell(solids, shown="solids")

@@ -38,10 +38,10 @@ class Materials(Checked):
         roughness: GGX roughness of dielectrics.
         specular: Reflectance of dielectrics at normal incidence.
         texture_gain: Factor on the colours of coloured surfaces.
-        texture_tint: Largest relative deviation of a colour channel from ``texture_gain``, for
-            scans by another camera.
-        texture_noise: Relative amplitude of noise on coloured surfaces, for stains and openings
-            that are missing in the model.
+        texture_tint: Largest relative deviation of a colour channel from ``texture_gain``, to
+            imitate scans by different cameras.
+        texture_noise: Relative amplitude of noise on coloured surfaces, to imitate stains and
+            openings that the model lacks.
         noise: Relative amplitude of noise on the albedo of an untextured surface.
         noise_pitch: Distance between the noise's lattice points over the object's radius.
         metal_share: Share of untextured surfaces that are bare metal.
@@ -52,7 +52,7 @@ class Materials(Checked):
         brush_slope: Largest slope of a mark's flanks, the tangent of the normal's tilt.
         print_share: Share of untextured dielectrics that are 3D prints with layer lines.
         layer_pitch: Height of a print's layers, metres.
-        layer_slope: Largest slope of the layers' flanks, as ``brush_slope``.
+        layer_slope: Largest slope of the layers' flanks, defined like ``brush_slope``.
         alike_share: Probability that all instances of a part in an image share a material.
     """
 

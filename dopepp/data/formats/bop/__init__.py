@@ -55,7 +55,7 @@ class BopPoses:
     """The posed objects of one or more images.
 
     Attributes:
-        obj_ids: BOP's object numbers; −1 if damaged.
+        obj_ids: BOP object IDs; −1 if damaged.
         T_cam_obj: Rigid transforms, metres; NaN if damaged.
         visible_fractions: Annotated ``visib_fract``; NaN if missing.
         inexact: Whether the nearest rotation replaces the annotated matrix (``INEXACT``).

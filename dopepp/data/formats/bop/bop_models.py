@@ -90,11 +90,11 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
 
 
 def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
-    """Return the parts by BOP's object numbers.
+    """Return the parts by BOP object ID.
 
     Raises:
-        UserError: A part is not in ``models_info.json`` or, without this file, not named like
-            ``obj_000001``.
+        UserError: A part is not in ``models_info.json``. If this file is missing, the part's name
+            is not of the form ``obj_000001``.
     """
     names = {info.name: number for number, info in read_models(root).items()}
     numbered: dict[int, Part] = {}

@@ -184,7 +184,7 @@ def make_labels(
 
     Args:
         sample: A rendered image, with depth and a mask of each instance.
-        object_ids: BOP's object numbers by label.
+        object_ids: BOP object IDs by label.
         parts: Parts and surfaces by label.
     """
     visible = [instance.mask for instance in sample.instances if instance.mask is not None]
