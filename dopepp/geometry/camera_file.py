@@ -168,7 +168,7 @@ def _read_text(path: Path) -> str:
 def _check_and_crop(
     K: CameraMatrix, calibrated: Size | None, size: Size, crop: Crop
 ) -> CameraMatrix:
-    """Return K of a crop, after checking its size and position in the calibrated image."""
+    """Check a crop against the sizes of the image and the calibrated image; return the crop's K."""
     x, y, width, height = crop
     stated = "--crop " + " ".join(map(str, crop))
     if (width, height) != size:

@@ -30,7 +30,7 @@ class Focal(NamedTuple):
     Attributes:
         factor: Factor on the focal lengths.
         deviation: Standard deviation of the factor's logarithm.
-        gain: Robust reprojection cost per degree of freedom before the correction, over that after.
+        gain: Ratio of robust reprojection costs per degree of freedom, before to after correction.
     """
 
     factor: float
@@ -58,7 +58,7 @@ def focal_factor(
     extent = float(np.ptp(keypoints[is_known], axis=0).max())
 
     def errors(values: Float[np.ndarray, "unknowns"], first: float) -> Float[np.ndarray, "errors"]:
-        """Return reprojection errors over the extent, for a step and log(factor / ``first``)."""
+        """Return reprojection errors, in extents, for a pose step and log(factor / ``first``)."""
         step, lens, start = values[:6].copy(), K.copy(), T_cam_obj.copy()
         factor = first * math.exp(values[6]) if len(values) > 6 else first
         lens[[0, 1], [0, 1]] *= factor

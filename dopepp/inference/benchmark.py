@@ -58,7 +58,7 @@ def time_frames(estimator: PoseEstimator, images: CameraImages, num_frames: int)
 class ExportAgreement:
     """Largest differences of maps and poses between an exported network and the original."""
 
-    maps: float  # difference of a map value over the largest value (at least 1)
+    maps: float  # difference of a map value, divided by the largest value (at least 1)
     position_mm: float
     rotation_deg: float
     num_poses: int  # best-scored poses that both networks detect

@@ -38,8 +38,8 @@ PREDICTION_PX: Final = 4.0  # deviation of a keypoint from its prediction: half 
 CANDIDATES: Final = 3  # number of peaks per corner, by belief and direction, that form triples
 
 PERSPECTIVE: Final = 0.1
-"""Deviation of corners from the affine camera, over their distance from the centroid: at a distance
-of five times the part's size, corners are up to 10 % nearer or farther than the centroid."""
+"""Deviation of corners from the affine camera, in distances from the centroid: at a distance of
+five times the part's size, corners are up to 10 % nearer or farther than the centroid."""
 
 SIGMA_FLOOR_PX: Final = 1.0  # bounds the weight of a sharp peak against a blurred peak
 WIDENINGS: Final = (1.0, 2.0, 4.0)  # factors on the standard deviations of peaks, tried in turn

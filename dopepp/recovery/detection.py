@@ -45,7 +45,7 @@ REFINED_COVARIANCE_FACTORS: Final = (0.1, 4.0)
 """Range for refined poses. Refinement assumes errors that renders do not have, e.g. shadows and
 inaccurate meshes, so its covariances are too large on renders."""
 
-PASSING: Final = 0.1  # ADD over the diameter below which a pose is correct
+PASSING: Final = 0.1  # ADD, in diameters, below which a pose is correct
 
 # Squared Mahalanobis distances that 75 % and 10 % of 6D Gaussian errors exceed.
 _QUARTER: Final = 3.455
@@ -53,7 +53,7 @@ _TENTH_BEYOND: Final = 10.645
 _WRONG_RANGE: Final = math.log(1e6)  # range of ln(squared distance) of wrong poses
 _CERTAIN: Final = 1e-3  # beliefs are clipped to this distance from 0 and 1
 _EXPONENTS: Final = 4.0  # limit of logarithms and Newton steps, so that outliers do not dominate
-_TYPICAL_MISFIT: Final = 0.01  # average reprojection error over the size in the image
+_TYPICAL_MISFIT: Final = 0.01  # average reprojection error / size in the image
 _RIDGE: Final = 0.1  # weight of the squared weights, in detections; keeps the weights finite
 _DEFAULTS_RIDGE: Final = 1.0  # weight of the squared distance from default weights, in detections
 _STEPS: Final = 50  # maximum number of iterations of a fit

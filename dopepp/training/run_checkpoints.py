@@ -200,7 +200,7 @@ def check_free_space(run_dir: Path, weight_bytes: int) -> None:
 
 
 def sweep(run_dir: Path) -> None:
-    """Remove unfinished files of processes that no longer run from the run folder."""
+    """Remove from the run folder all unfinished files whose process has ended."""
     for folder in (run_dir, run_dir / FOLDER):
         for path in folder.glob(f".*{PARTIAL_SUFFIX}"):
             if is_abandoned(path, time.time()):

@@ -42,8 +42,8 @@ class SymmetryOptions(Checked):
 
     Attributes:
         canonical: Whether targets use the equivalent pose nearest to the reference orientation.
-        border_deg: An equivalent pose may be used, if its loss is lower, when its angle to the
-            reference exceeds the smallest angle by less than this, degrees.
+        border_deg: Margin, degrees. An equivalent pose with a lower loss may be used if its angle
+            to the reference is within this margin of the smallest angle.
 
     Raises:
         UserError: ``border_deg`` is above 0 without ``canonical``.

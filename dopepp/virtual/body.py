@@ -28,7 +28,7 @@ from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
 
 WALL: Final = 0.03
-"""Thickness of a bin's walls over the side length of its interior."""
+"""Thickness of a bin's walls, divided by the side length of its interior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,9 +203,9 @@ class Distractors(Checked):
     Attributes:
         number: Number per image; distractors that would hide too much of a target are omitted.
         image_share: Diameter of a distractor shape in the image, image widths.
-        depth: Depth of floating distractors over the depth of the first target; unused on a table.
+        depth: Depth of floating distractors, in depths of the first target; unused on a table.
         lookalike_share: Probability that a distractor is a negative part, if negatives exist.
-        lookalike_scale: Size of a negative over its real size.
+        lookalike_scale: Size of a negative, divided by its real size.
     """
 
     number: Annotated[tuple[int, int], Span(0, 100, "a count")] = (0, 2)

@@ -25,7 +25,7 @@ from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.tabletop import draw_view
 
 _IMAGE_WIDTH: Final = 5.0  # width of the image for the size of distractors, diameters
-_LARGEST: Final = 2.0  # largest diameter of a negative over that of the largest target
+_LARGEST: Final = 2.0  # largest diameter of a negative, in diameters of the largest target
 _GAP: Final = 0.01  # smallest distance between layers of falling objects, diameters
 _MIN_ROOM: Final = 1.2  # smallest side of the drop area, diameters
 _TRIALS: Final = 8

@@ -110,7 +110,7 @@ def check_translation(node: Node, translation: Vector, diameter: float | None) -
 def plausible_camera(
     node: Node, K: CameraMatrix | None, shape: Shape | None
 ) -> CameraMatrix | None:
-    """Return K (pixels); None if it is missing, not finite or implausible (which is reported)."""
+    """Return K (pixels), or None if it is missing, not finite or reported as implausible."""
     if K is None or not np.isfinite(K).all():
         return None
     if shape is None:

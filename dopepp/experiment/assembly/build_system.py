@@ -189,7 +189,7 @@ def build_trainer(
         further: Callbacks besides those of the config.
 
     Raises:
-        UserError: An option of the trainer or of a callback is wrong.
+        UserError: An option of the trainer or of a callback is invalid.
     """
     options, accelerator = config.trainer, config.trainer.accelerator
     if accelerator in ("auto", "gpu") and torch.cuda.is_available():

@@ -99,7 +99,7 @@ class VirtualConfig:
         """Parse the node ``virtual``, including the camera and preset files that it names.
 
         Raises:
-            UserError: An option is unknown or wrong.
+            UserError: An option is unknown or invalid.
         """
         return parse(cls, with_files(node or {}), "virtual")
 
@@ -108,7 +108,7 @@ class VirtualConfig:
         """Camera with its working distance; None if the preset's camera is used.
 
         Raises:
-            UserError: Only one of camera and working distance is set, or a value is wrong.
+            UserError: Only one of camera and working distance is set, or a value is invalid.
         """
         if self.camera is None and self.working_distance is None:
             return None
@@ -295,7 +295,7 @@ def evaluation_data(
         source: Path of the checkpoint, for messages.
 
     Raises:
-        UserError: Neither the user nor the checkpoint names the data, or an option is wrong.
+        UserError: Neither the user nor the checkpoint names the data, or an option is invalid.
     """
     given, base = data or {}, stored if isinstance(stored, dict) else {}
     whole = "name" in given  # a file of conf/data, not single options

@@ -121,7 +121,7 @@ class TrainerConfig:
         """Number of training processes on all machines.
 
         Raises:
-            UserError: ``trainer.devices`` is wrong.
+            UserError: ``trainer.devices`` is invalid.
         """
         # torchrun states the number of processes that it has started.
         world_size = os.environ.get("WORLD_SIZE", "")
@@ -190,8 +190,8 @@ class FalsePositiveTarget:
     """Permitted rate of false positives on camera frames without objects.
 
     Attributes:
-        num_empty: Number of frames without objects that choose the threshold, and of further ones
-            that check it (:mod:`dopepp.experiment.assembly.negative_frames`).
+        num_empty: Number of frames without objects for choosing the threshold, and of other frames
+            for checking it (:mod:`dopepp.experiment.assembly.negative_frames`).
         false_positive_rate: Largest share of these frames that may show a detection; with 1, every
             candidate is reported.
     """
@@ -221,7 +221,7 @@ class Protocols:
         """Read the options from a config; ``scale_factors`` may be absent.
 
         Raises:
-            UserError: An option is wrong.
+            UserError: An option is invalid.
         """
         shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
         bounds = (1 / _MAX_SCALE, _MAX_SCALE)
@@ -314,8 +314,8 @@ class RunConfig(MeasurementConfig):
         seed: Seed of the initial weights, and of the content and order of the training images.
         compile: Whether to compile the network with torch.
         ema: Decay of an exponential moving average of the weights; None disables it.
-        stop_at: Share of the parts with a correct refined pose that ends the training, once further
-            held-out images confirm the share; None: the training has its full length.
+        stop_at: Share of parts with a correct refined pose at which the training ends, if further
+            held-out images confirm the share; None trains for all epochs.
         keep_checkpoints: Whether to keep the checkpoints after the measurement.
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
@@ -365,7 +365,7 @@ class RunConfig(MeasurementConfig):
         """Parse a config that Hydra has composed and resolved.
 
         Raises:
-            UserError: An option is unknown, missing or wrong.
+            UserError: An option is unknown, missing or invalid.
         """
         plain = {**config, "virtual": with_files(config.get("virtual"))}
         data = DataConfig.of(plain.get("data"), plain["virtual"])
@@ -422,7 +422,7 @@ class EvaluationConfig(MeasurementConfig):
         """Parse a config that Hydra has composed and resolved.
 
         Raises:
-            UserError: An option is unknown, missing or wrong.
+            UserError: An option is unknown, missing or invalid.
         """
         return _parsed(cls, config)
 

@@ -258,7 +258,7 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
 
 
 def coverage_curve(instances: EvaluatedInstances) -> RateCurve | None:
-    """Return the observed coverage of an object's covariance regions over the nominal coverage.
+    """Return the observed against the nominal coverage of an object's covariance regions.
 
     The curve covers matched poses with a covariance; None without any.
     """

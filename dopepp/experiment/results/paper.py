@@ -113,7 +113,7 @@ class PaperTable:
         """Read the ``table`` of an experiment's file, ``conf/experiment/NAME.yaml``.
 
         Raises:
-            UserError: The file cannot be read, or its table is missing or wrong.
+            UserError: The file cannot be read, or its table is missing or invalid.
         """
         config = read_yaml(path)
         table = config.get("table") if isinstance(config, dict) else None

@@ -82,7 +82,7 @@ def measure_and_record(
         A report per estimator, then per file.
 
     Raises:
-        UserError: The data or a file of poses is wrong.
+        UserError: The data or a file of poses is invalid.
     """
     protocols = protocols or Protocols()
     source = held_out_source(data, parts, "test")

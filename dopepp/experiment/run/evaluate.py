@@ -127,7 +127,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         A report per method; none after tuning.
 
     Raises:
-        UserError: An option, a file or the data is wrong.
+        UserError: An option, a file or the data is invalid.
     """
     program.quiet_lightning()
     options = EvaluationConfig.of(config)

@@ -63,8 +63,8 @@ def export(
 
     Raises:
         UserError: The checkpoint, an option or the path is invalid, or a package is not installed.
-        RunError: An fp32 export differs by more than rounding, another export has non-finite maps,
-            or the file cannot be written. Nothing was written.
+        RunError: An fp32 export differs from the checkpoint by more than rounding, another export
+            has non-finite maps, or the file cannot be written. Nothing was written.
     """
     target = _output_path(path, layout, precision, out)
     if runtimes.is_export(path):

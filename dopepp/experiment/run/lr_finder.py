@@ -70,7 +70,7 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     The sweep uses the chosen optimiser without schedule, validation and checkpoints.
 
     Raises:
-        UserError: An option is wrong.
+        UserError: An option is invalid.
         RunError: The loss diverges within the first steps.
     """
     if config.resume is not None:

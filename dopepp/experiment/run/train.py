@@ -103,7 +103,7 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
     Raises:
-        UserError: An option, a file or the data is wrong.
+        UserError: An option, a file or the data is invalid.
         PrunedError: A search stopped the training.
         Interruption: A signal ended the training; the message names the last checkpoint.
     """

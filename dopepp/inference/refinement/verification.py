@@ -44,15 +44,15 @@ EVIDENCE: Final = (
     "outline_weakest",  # mean response of the second weakest eighth of the outline
     "crease",  # mean response along visible creases
     "crease_gain",  # crease response minus the response of shifted creases
-    "creases",  # number of crease points over the number of outline points, at most 1
+    "creases",  # ratio of crease points to outline points, at most 1
     "contrast",  # difference of the colours on both sides of the outline, in [0, 1]
     "inside",  # mean log odds of the colours inside the outline
     "outside",  # mean log odds of the colours around it
     "shading",  # share of the variance inside that a linear model of the normals explains
     "residual",  # logarithm of the ratio of unexplained deviations, inside to surroundings
     "moved",  # Mahalanobis distance from the network's pose
-    "spread",  # logarithm of the stated deviation of the part's points over a tenth of the diameter
-    "size",  # logarithm of the extent on the image over 100 pixels
+    "spread",  # logarithm of the stated deviation of the part's points in tenths of the diameter
+    "size",  # logarithm of the extent in the image in units of 100 pixels
 )
 """Features of a pose and an image, in the order in which the verification model reads them."""
 

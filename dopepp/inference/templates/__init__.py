@@ -254,7 +254,7 @@ class TemplateDetector:
     def _matches(self, image: RGBImage, size: float, nearness: float) -> Matches:
         """Return the best matches of all templates at one distance.
 
-        ``size`` is the projected diameter, pixels, and ``nearness`` the diameter over the distance.
+        ``size`` is the projected diameter, pixels; ``nearness`` is the diameter / the distance.
         """
         most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
         scale = min(1.0, most, COARSE_PX / size)

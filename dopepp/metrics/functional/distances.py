@@ -256,7 +256,7 @@ def _checked(
 
 
 def _check_cameras(K: Tensor, num_poses: int) -> Rotations:
-    """Return a camera matrix for every pose, in pixels."""
+    """Check the shape of K (pixels), and return a camera matrix for every pose, (N, 3, 3)."""
     K = to_float64(K)
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (num_poses,)):
         raise ValueError(f"K must be (3, 3) or (N, 3, 3) of N = {num_poses}, got {tuple(K.shape)}")

@@ -200,7 +200,7 @@ def _scatter(rng: Generator, image: RGBImage, count: int) -> None:
 
 _PLAIN_SHARE: Final = 0.4  # share of pieces of one colour with a brightness gradient
 _PRINTED_SHARE: Final = 0.2  # share of pieces with dark and light cells, like markers
-_WIDTHS: Final = (0.04, 0.4)  # a piece's width over the image's, log-uniform
+_WIDTHS: Final = (0.04, 0.4)  # a piece's width in image widths, log-uniform
 _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 
 

@@ -43,7 +43,7 @@ class Materials(Checked):
         texture_noise: Relative amplitude of noise on coloured surfaces, to imitate stains and
             openings that the model lacks.
         noise: Relative amplitude of noise on the albedo of an untextured surface.
-        noise_pitch: Distance between the noise's lattice points over the object's radius.
+        noise_pitch: Distance between the noise's lattice points, in radii of the object.
         metal_share: Share of untextured surfaces that are bare metal.
         metal_albedo: Reflectance of metals at normal incidence.
         metal_roughness: GGX roughness of metals.

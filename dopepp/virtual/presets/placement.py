@@ -54,7 +54,7 @@ class FacingTurning(Checked):
 
     Attributes:
         in_plane_deg: Largest rotation about the optical axis to either side.
-        tilt_deg: Largest angle between the part's +z and the direction against the optical axis.
+        tilt_deg: Largest angle between the part's +z axis and the reversed optical axis.
     """
 
     in_plane_deg: Angle = 45.0
@@ -215,8 +215,8 @@ class FillPlacement(_Placement):
     image height. The distance is found by iteration.
 
     Attributes:
-        smallest: Smallest share.
-        largest: Largest share.
+        smallest: Smallest share of the image's width or height.
+        largest: Largest share of the image's width or height.
     """
 
     _ends = ("smallest", "largest")

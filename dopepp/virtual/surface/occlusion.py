@@ -20,7 +20,7 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.parts.mesh import Faces, Vertices
 from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
-_FINEST: Final = 1 / 96  # spacing of the points over the mesh's size; at most 96 steps per edge
+_FINEST: Final = 1 / 96  # spacing of the points in mesh sizes; at most 96 steps per edge
 _MAP_SIDE: Final = 192  # texels across a depth map
 
 

@@ -25,7 +25,7 @@ from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 Lookup = tuple[Array, Array, Array]
 
 _MAX_PROBES: Final = 16  # along a footprint's longer axis; more stretched textures blur
-_SHARPNESS: Final = 0.75  # a probe's width over the footprint's; interpolation widens it again
+_SHARPNESS: Final = 0.75  # a probe's width in footprint widths; interpolation widens it again
 
 
 @dataclass(frozen=True, eq=False)

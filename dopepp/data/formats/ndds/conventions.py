@@ -79,9 +79,9 @@ POSE_CONVENTIONS: Final = tuple(
 
 @dataclass(frozen=True)
 class Observation:
-    """An annotated object of a known part, whose reprojection tests conventions.
+    """An annotated object of a known part; its reprojection error serves to test conventions.
 
-    ``fixed`` is :meth:`~dopepp.data.formats.ndds.NddsSettings.fixed_transform` of the class.
+    ``fixed`` is the ``fixed_model_transform`` of its class, mesh to object frame; None if missing.
     """
 
     item: NddsObject

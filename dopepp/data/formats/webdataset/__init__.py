@@ -61,7 +61,7 @@ class ShardIndex:
     spans: Int64[np.ndarray, "images 6 2"]
 
     def read(self, image: int, field: str) -> bytes | None:
-        """Return the content of a member in :data:`FIELDS` of an image, or None if missing."""
+        """Return the content of an image's ``field`` (in :data:`FIELDS`), or None if missing."""
         offset, size = self.spans[image, FIELDS.index(field)].tolist()
         return None if offset < 0 else read_span(self.path, offset, size)
 

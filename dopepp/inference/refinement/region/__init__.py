@@ -137,7 +137,7 @@ class RegionRefiner:
     def refine_with(
         self, image: RGBImage, K: CameraMatrix, depth: DepthEvidence, start: Solution
     ) -> Outcome:
-        """Refine on image and depth together, from the end of a descent on one of them.
+        """Refine on image and depth together, starting at the solution of image or depth alone.
 
         Raises:
             UndecidedError: The image does not determine the pose.

@@ -26,7 +26,7 @@ from dopepp.virtual.surface import Surface
 
 Sphere = tuple[Vector, float]  # centre and radius, camera frame, metres
 
-LAMP_SHARE: Final = 0.06  # a lamp's radius over its distance: a bulb of 6 cm at half a metre
+LAMP_SHARE: Final = 0.06  # a lamp's radius / its distance: a bulb of 6 cm at half a metre
 _MAX_ALBEDO: Final = 0.95  # a higher albedo would be unphysical and prolong paths
 _VERTEX_COLOUR: Final = "vertex_colour"
 _SKY_ROWS: Final = 64

@@ -97,7 +97,7 @@ def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
 def _fractions(
     scene: Scene, projections: Sequence[Projection], instances: Int16[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "objects"]:
-    """Return each object's visible pixels over the pixels of its silhouette without occluders."""
+    """Return the visible share of each object's whole silhouette."""
     visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projections) + 1)[1:]
     fractions = np.zeros(len(projections))
     for index in np.flatnonzero(visible).tolist():
