@@ -72,7 +72,7 @@ def options_page() -> str:
     blocks = [
         HEADER,
         "# Options",
-        "An option is typed as `name=value` behind `python train.py` or `python evaluate.py`; a "
+        "An option is typed as `name=value` after `python train.py` or `python evaluate.py`; a "
         "group's choice as `group=choice`. `--cfg job` prints the whole configuration of a "
         "command. A unit in brackets, e.g. [metres], follows the meaning; two numbers "
         "`[low,high]` are the range of a random value.",

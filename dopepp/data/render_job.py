@@ -121,7 +121,7 @@ def make_job(
     check("--views", views, int, Range(1, MAX_VIEWS))
     if views > 1 and layout != "bop":
         problem = f"--views {views} with --format {layout}"
-        raise UserError(problem, "--views with --format bop only", "leave out --format, or --views")
+        raise UserError(problem, "--views only with --format bop", "leave out --format, or --views")
     scenes = preset_of(preset, _nested(changes))
     targets = [named_part(text, unit) for text in parts]
     if camera is not None or working_distance is not None:

@@ -127,7 +127,7 @@ class CameraInfo:
         """
         if not any(self.K):
             raise UserError(
-                f"{source} with a K of zeros",
+                f"{source}, whose K is all zeros",
                 "the camera_info of a calibrated camera",
                 "calibrate it (`dopepp calibrate camera`) and give the driver the file, or pass it "
                 "here: --camera camera.yaml",

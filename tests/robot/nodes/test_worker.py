@@ -54,7 +54,7 @@ def test_poses_are_those_of_the_undistorted_image(worker, take, estimator, camer
 @pytest.mark.parametrize(
     ("changes", "problem", "fix"),
     [
-        ({"k": [0.0] * 9}, "a K of zeros", "dopepp calibrate camera"),
+        ({"k": [0.0] * 9}, "K is all zeros", "dopepp calibrate camera"),
         ({"width": 640, "height": 480}, "640×480, and images of 320×240", "camera_info of these"),
         ({"distortion_model": "equidistant"}, "equidistant", "undistort"),
         ({"d": [0.1] * 3}, "3 distortion coefficients", "zeros"),
