@@ -86,7 +86,8 @@ def settle(
     distinct = {id(solid): solid for solid in solids}  # most solids are copies of one part
     pieces = [piece for solid in distinct.values() for piece in solid]
     counts = np.array([len(solid) for solid in distinct.values()])
-    kinds = np.array([list(distinct).index(id(solid)) for solid in solids])
+    order = list(distinct)
+    kinds = np.array([order.index(id(solid)) for solid in solids])
     for array in (*pieces, *walls, starts, counts, kinds, np.array([len(walls), diameter])):
         digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
     path = cache_folder() / "piles" / f"{digest.hexdigest()[:24]}.npy"
