@@ -125,7 +125,7 @@ class HybridSource:
         return any(source.contains(label) for source in self._sources.values())
 
     def describe(self) -> list[SourceInfo]:
-        """Return the entries of all sources with a share above 0."""
+        """Return the descriptions of all sources with a share above 0."""
         mix = {"seed": self._seed, "samples_per_epoch": self._length}
         entries = []
         for role, source in self._sources.items():

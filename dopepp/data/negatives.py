@@ -129,5 +129,5 @@ class FrameMix:
         return any(source.contains(label) for source in self.sources)
 
     def describe(self) -> list[SourceInfo]:
-        """Return the entries of all sources."""
+        """Return the descriptions of all sources."""
         return [info for source in self.sources for info in source.describe()]

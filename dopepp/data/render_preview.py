@@ -68,7 +68,7 @@ def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> RGBImage:
 
 
 def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
-    """Yield captioned tiles: the image, cuboids and axes on it, masks on it, and its depth."""
+    """Yield four captioned tiles: the image, overlays of cuboids and masks, and the depth."""
     sample = rendered_sample(rendered, "virtual", name)
     width, height = sample.size
     scene = rendered.scene

@@ -174,7 +174,7 @@ def rates_figure(
 
 
 def coverage_figure(curves: Mapping[str, RateCurve]) -> Figure:
-    """Draw the observed (``rate``) over the nominal coverage (``x``) of pose covariances.
+    """Draw the observed (``rate``) against the nominal coverage (``x``) of pose covariances.
 
     Coverage is the share of true poses in the confidence region of a probability, 0 to 1.
     """

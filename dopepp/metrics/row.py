@@ -287,7 +287,7 @@ def _mspd_5px(errors: PoseErrors) -> float | None:
 
 
 def _median_deviations(errors: PoseErrors) -> float | None:
-    """Return the median Mahalanobis distance, divided by its value for exact covariances."""
+    """Return the median Mahalanobis distance, divided by its value for correct covariances."""
     median = _median("mahalanobis")(errors)
     return None if median is None else median / _USUAL_MAHALANOBIS
 

@@ -221,7 +221,7 @@ def copy_layer(
     ``path`` of the file and the name of the expected ``network`` are for messages.
 
     Raises:
-        UserError: A tensor is missing or has another shape.
+        UserError: A tensor is missing or has a different shape.
     """
     for key, parameter in layer.state_dict().items():
         value = weights.get(f"{name}.{key}")

@@ -161,7 +161,7 @@ class ChainBranch(nn.Sequential, Branch):
         return [cast(nn.Conv2d, self[-1])]
 
     def forward(self, features: Features) -> list[Features]:
-        """Return a list of the maps of the last layer."""
+        """Return the maps of the last layer, as a list with a single entry."""
         return [super().forward(features)]  # type: ignore[no-untyped-call]
 
 

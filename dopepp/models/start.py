@@ -26,10 +26,10 @@ _FILE: Final = Path(__file__).parents[1] / "pretrained" / "start" / "dopepp_fast
 def start_from_parts(network: PoseNetwork) -> bool:
     """Copy the package's weights, learned from random parts, to backbone and head if they fit.
 
-    The output layers, which belong to the objects, and the attention keep their weights.
+    The attention and the object-specific output layers keep their initial weights.
 
     Returns:
-        Whether the weights fit; a network of another shape is left as it is.
+        Whether the weights fit; otherwise the network remains unchanged.
     """
     weights, _ = read_safetensors(_FILE)
     of_attention = {name for name in network.state_dict() if name.startswith("attention.")}
@@ -39,10 +39,10 @@ def start_from_parts(network: PoseNetwork) -> bool:
 def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
     """Copy the weights of a checkpoint to a network.
 
-    The output layers keep their weights if the checkpoint has another number of objects.
+    The output layers keep their initial weights if the numbers of objects differ.
 
     Raises:
-        UserError: The checkpoint cannot be read, or its network has another architecture.
+        UserError: The checkpoint cannot be read, or its network has a different architecture.
     """
     checkpoint = read(path)
     weights = checkpoint.state_dict

@@ -262,7 +262,7 @@ def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
 
 
 def _storage_reference(value: object) -> tuple[str, str, int]:
-    """Return kind, key and number of values of a storage reference in a pickle."""
+    """Return the kind, key and number of values of a storage reference in a pickle."""
     match value:
         case ("storage", _Name() as kind, str(key), str(), int(count), *_):
             if kind in _STORAGE_BYTES and key.isascii():

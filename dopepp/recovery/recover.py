@@ -201,7 +201,7 @@ def _rejected(
     cells: tuple[int, int],
     stride: int,
 ) -> tuple[Kind, float, str]:
-    """Return kind, ``best`` and text of the reason for rejecting a candidate.
+    """Return the kind, ``best`` and the text of the reason for rejecting a candidate.
 
     ``cells`` is the (width, height) of the maps.
     """

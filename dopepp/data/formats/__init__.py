@@ -116,7 +116,7 @@ def make_instance(
 
 
 def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Read a JSON object that a writer extends; return an empty object if the file is missing.
+    """Read the JSON object that a writer will extend; return an empty one if the file is missing.
 
     Raises:
         UserError: The file is not a JSON object.

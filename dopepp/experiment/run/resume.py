@@ -123,7 +123,7 @@ def check_resume(
 
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
-    """Return the options in which two configs differ, except the options of :data:`_THIS_CALL`."""
+    """Return the options in which two configs differ, except those that only resume a run."""
     before, after = dict(flatten(old)), dict(flatten(new))
     return [
         ConfigDifference(key, (str(before.get(key, _ABSENT)), str(after.get(key, _ABSENT))))

@@ -70,8 +70,8 @@ MIN_REFINED_SCORE: Final = 0.1
 never reported, even if the images without the objects permit a lower threshold."""
 
 MIN_REFINED_FACTOR: Final = 0.5
-"""Smallest covariance factor of refined poses. Smaller factors fit renders of the network's size,
-and make covariances too small on larger images and on real ones."""
+"""Smallest covariance factor of refined poses. Smaller factors fit renders at the network's
+input size, and make covariances too small on larger images and on real images."""
 
 MIN_REFINED: Final = 20  # smallest number of correct poses that determine a covariance factor
 

@@ -143,7 +143,7 @@ class Case:
 
     @cached_property
     def refined(self) -> Detection | None:
-        """Best detection with the agreement of its outline; None without a mesh or detection."""
+        """Best detection including its outline agreement; None without a mesh or detection."""
         if self.detection is None or any(part.mesh is None for part in self.parts):
             return None
         if self.estimator.refiner is not None:

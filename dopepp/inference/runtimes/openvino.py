@@ -127,7 +127,7 @@ def _shapes(model: Any) -> dict[str, list[int] | None]:
 
 
 def _check_xml(content: bytes, num_weights: int, path: Path) -> str | None:
-    """Check that an XML is one plain graph with constants in the weights; return its metadata."""
+    """Reject nested graphs and constants outside the weights file; return the XML's metadata."""
     if b"<!" in content:
         problem = "an XML file with declarations or comments"
         raise invalid_export(path, problem, "an XML file of layers and edges only")

@@ -35,7 +35,7 @@ def read_obj(path: Path) -> RawMesh:
 
     Raises:
         UserError: A line is damaged, a polygon is not convex, a material file or a texture is
-            missing, outside the folder or damaged, or there is more than one texture.
+            missing, damaged or outside the mesh's folder, or there is more than one texture.
     """
     obj = ObjFile()
     for number, line in enumerate(_text(path).replace("\\\n", " ").split("\n"), start=1):

@@ -69,7 +69,7 @@ def read_ply(path: Path) -> RawMesh:
     A texture, named by a ``TextureFile`` comment, replaces the colours.
 
     Raises:
-        UserError: The texture is missing, damaged or outside the folder.
+        UserError: The texture is missing, damaged or outside the mesh's folder.
         ValueError: The file is damaged or has no vertices or faces, a polygon is not convex, a
             colour is out of range, or there are several textures or no texture coordinates.
     """
@@ -175,9 +175,9 @@ def _doubles(text: bytes) -> bytes:
 
 
 def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
-    """Read all rows of an element from byte ``start``; also return the end of the last row.
+    """Read all rows of an element from byte ``start``; also return the byte after the last row.
 
-    The rows are read at once if all have lists of equal length, otherwise one after the other.
+    If all rows have lists of equal length, they are read at once, otherwise one by one.
     """
     name, num_rows, columns = element
     too_short = ValueError(f"less data than {num_rows} rows of element {name}")

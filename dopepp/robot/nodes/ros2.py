@@ -308,7 +308,7 @@ class Pace:
         self._answered = 0
 
     def count(self, latency_s: float) -> None:
-        """Add an answer; ``latency_s`` is the time since its image was captured, seconds."""
+        """Record an answer; ``latency_s`` is the time since its image was captured, seconds."""
         self._times.append(self._clock())
         self._latencies.append(1000 * latency_s)
         self._answered += 1

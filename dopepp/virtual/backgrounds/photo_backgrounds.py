@@ -75,7 +75,7 @@ class PhotoBackgrounds:
         return self.__dict__ | {"_photos": OrderedDict(), "_kept_bytes": 0}
 
     def identity(self) -> list[str]:
-        """Return kind and split, number of photos, and a hash of their relative paths and sizes."""
+        """Return the kind and split, the number of photos, and a hash of their paths and sizes."""
         digest = hashlib.sha256()
         for path in self.paths:
             name = path.relative_to(self.folder).as_posix()

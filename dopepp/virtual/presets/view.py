@@ -192,6 +192,6 @@ def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
 
 
 def _named(parts: Sequence[Part], choose: Callable[..., Part]) -> str:
-    """Return name and diameter of the part that ``choose`` (min or max) selects by diameter."""
+    """Return the name and diameter of the part that ``choose`` (min or max) selects by diameter."""
     part = choose(parts, key=lambda part: part.diameter)
     return f"{part.name} ({1000 * part.diameter:.0f} mm across)"

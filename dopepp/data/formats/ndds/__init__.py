@@ -160,7 +160,7 @@ class NddsSettings:
         return self._files[path]
 
     def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
-        """Return path and content of settings in the annotation's folder, or else in the root."""
+        """Return the path and content of settings in the annotation's folder, or in the root."""
         for path in (annotation.with_name(name), self._root / name):
             content = self.read(path)
             if content is not None:
@@ -239,7 +239,7 @@ class NddsSettings:
     def _arrays(
         self, annotation: Path, label: str, name: str, *shape: int
     ) -> Iterator[NDArray[np.float64]]:
-        """Yield field ``name`` of a class's entries as arrays; skip fields of another shape."""
+        """Yield field ``name`` of a class's entries as arrays; skip fields of a different shape."""
         for entry in self._objects(annotation, label):
             with suppress(KeyError, TypeError, ValueError, OverflowError):
                 yield np.array(entry[name], np.float64).reshape(shape)

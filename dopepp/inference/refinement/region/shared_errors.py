@@ -7,8 +7,8 @@ All points share two errors, which are unknowns with a prior:
 - Scale: a larger part or focal length has the same effect on the outline as a nearer part. All
   errors up to a limit are equally likely. The pose is corrected by the expected error: a precise
   prior keeps its distance while prior and outline differ by less than the limit, and a broad prior
-  lets the outline determine it. A normally distributed error would move every distance, even
-  a correct one, part of the way to the outline's distance.
+  lets the outline determine the distance. A normally distributed error would move every distance,
+  even a correct distance, part of the way to the outline's distance.
 
 Neighbouring points have errors in common, and outliers get a small weight.
 """
@@ -85,8 +85,8 @@ def _eliminate_scale(
 ) -> None:
     """Eliminate a bounded error of the scale from the normal equations, in place.
 
-    The pose moves to the minimum of prior and outline under the expected error. The information is
-    that under a normal error of the same variance, so that the covariance contains the error.
+    The pose moves to the minimum of prior and outline for the expected scale error. ``H`` is
+    reduced as for a normally distributed scale error of the same variance.
 
     Args:
         H: Matrix of the outline's normal equations.

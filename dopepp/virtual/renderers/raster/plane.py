@@ -46,8 +46,8 @@ class _LitPlane(NamedTuple):
         to_point: Map from a pixel to its point on the plane and 1/z, shape (4, 3).
         normal: Unit normal, camera frame.
         sky: Linear RGB of the ambient light on the plane.
-        lights: ``light`` of every shadow map.
-        P: ``P`` of every shadow map.
+        lights: Position and colour of every light, see :class:`ShadowMap`, shape (lights, 6).
+        P: Projection of every shadow map, see :class:`ShadowMap`, shape (lights, 3, 4).
     """
 
     to_point: Array
