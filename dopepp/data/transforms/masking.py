@@ -20,7 +20,7 @@ from numpy.random import Generator
 
 from dopepp.core.validation import Checked, Share
 from dopepp.data.sample import Instance, Sample, silhouette
-from dopepp.drawing.pictures import Mask, RGBImage, Size
+from dopepp.drawing.pictures import Mask, RGBImage, Shape
 from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
@@ -53,7 +53,7 @@ class BackgroundCrops:
             occupied |= mask
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
-    def draw(self, size: Size, rng: Generator) -> RGBImage | None:
+    def draw(self, size: Shape, rng: Generator) -> RGBImage | None:
         """Return the first of ``max_draws`` random (height, width) crops with contrast, or None."""
         windows = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(windows) else 0):
@@ -62,7 +62,7 @@ class BackgroundCrops:
                 return crop
         return None
 
-    def search(self, size: Size, rng: Generator) -> RGBImage | None:
+    def search(self, size: Shape, rng: Generator) -> RGBImage | None:
         """Return a random crop among all crops of (height, width) that have contrast.
 
         If there are none, return a random crop with at least two colours, or None.
@@ -81,7 +81,7 @@ class BackgroundCrops:
                 return self._crop(int(rng.choice(windows)), size)
         return None
 
-    def largest(self, size: Size, rng: Generator) -> RGBImage | None:
+    def largest(self, size: Shape, rng: Generator) -> RGBImage | None:
         """Return a crop of (height, width), halved until :meth:`search` finds one, or None."""
         height, width = size
         while True:
@@ -92,7 +92,7 @@ class BackgroundCrops:
                 return crop
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
-    def _is_free(self, size: Size) -> Bool[np.ndarray, "rows columns"]:
+    def _is_free(self, size: Shape) -> Bool[np.ndarray, "rows columns"]:
         """Return whether a window of ``size`` shows no object, for each top left corner."""
         return np.asarray(_windows(self._integral, size) == 0)
 
@@ -102,13 +102,13 @@ class BackgroundCrops:
         sums, squares = cv2.integral2(self.image, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
         return sums, squares
 
-    def _crop(self, window: int, size: Size) -> RGBImage:
+    def _crop(self, window: int, size: Shape) -> RGBImage:
         """Return the window with this number, counting top left corners row by row."""
         row, column = divmod(window, self.image.shape[1] - size[1] + 1)
         return self.image[row : row + size[0], column : column + size[1]]
 
 
-def _windows(integral: np.ndarray, size: Size) -> np.ndarray:
+def _windows(integral: np.ndarray, size: Shape) -> np.ndarray:
     """Return the sums in all windows of (height, width) from an integral image."""
     height, width = size
     return np.asarray(
@@ -205,7 +205,7 @@ class RandomMask(Checked):
         return slices[0], slices[1]
 
     def _crop(
-        self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
+        self, crops: BackgroundCrops, size: Shape, rng: Generator, other: Backgrounds
     ) -> RGBImage | None:
         """Return a random crop of the image's background, at most (height, width) in size.
 

@@ -245,7 +245,7 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
         )
         lines.append(PlotLine(f"{name}, image to poses", seconds, whole, colour, False))
         lines.append(PlotLine(f"{name}, network alone", seconds, network_rate, colour, True))
-    write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
+    write_png(path, figure_image(lines_figure(lines, "time (s)", "frames per second")))
 
 
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
