@@ -74,13 +74,10 @@ class PoseMetricsCallback(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log means over objects; undefined means are NaN, undefined rotation errors omitted."""
-        rows = self.metrics.compute()
-        values = {name: getattr(rows[MEAN], name) for name in LOGGED}
-        objects = [row for name, row in rows.items() if name != MEAN]
-        areas = [row.auc_s_10cm if row.num_symmetries > 1 else row.auc_10cm for row in objects]
-        counted = [area for area in areas if area is not None]
-        values["selection"] = sum(counted) / len(counted) if counted else None
-        on_bar = "add_or_s_01d" if any(row.num_symmetries > 1 for row in objects) else "add_01d"
+        mean = self.metrics.compute()[MEAN]
+        values = {name: getattr(mean, name) for name in LOGGED}
+        values["selection"] = mean.auc_or_s_10cm
+        on_bar = "add_or_s_01d" if mean.num_symmetries > 1 else "add_01d"
         for name, value in values.items():
             # ModelCheckpoint needs a value even if the validation images have no objects.
             if value is None and name not in _OF_MATCHES:

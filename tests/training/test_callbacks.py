@@ -131,6 +131,21 @@ def test_a_validation_without_instances_logs_nan(validate, make_system, make_noi
     assert "val/median_rotation_deg" not in recorder.logged
 
 
+@pytest.mark.parametrize(("symmetries", "measure"), [(None, "add_01d"), (2, "add_or_s_01d")])
+def test_the_bar_shows_add_s_of_a_symmetric_part(symmetries, measure, part, make_datamodule):
+    turned = None if symmetries is None else np.diag([-1.0, -1.0, 1.0, 1.0])[None]
+    callback, on_bar = PoseMetricsCallback(), []
+    callback.metrics = PoseMetrics((replace(part, symmetries_discrete=turned),))
+    item = make_datamodule().val_item(0, 0)
+    callback.metrics.update([], item.instances, item.K, item.size[0])
+
+    def log(name: str, value: float, prog_bar: bool, rank_zero_only: bool) -> None:
+        on_bar.extend([name] if prog_bar else [])
+
+    callback.on_validation_epoch_end(None, SimpleNamespace(log=log))
+    assert on_bar == [f"val/{measure}"]
+
+
 def test_the_remaining_time_is_of_the_whole_run(monkeypatch):
     monkeypatch.setattr(TQDMProgressBar, "on_train_start", lambda *_: None)
     monkeypatch.setattr(TQDMProgressBar, "get_metrics", lambda *_: {"train/loss": 1.0})
