@@ -61,7 +61,8 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
 
 def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
     """Load the parts that renders show unlabelled: ``virtual.negatives``, other models of BOP."""
-    listed = [_negative(name, data.unit) for name in data.virtual.negatives]
+    names = data.virtual.negatives
+    listed = [_negative(name, data.unit, _modification_time(name)) for name in names]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
     hashes = {part.mesh_hash for part in (*parts, *listed)}
@@ -69,9 +70,18 @@ def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
 
 
 @lru_cache(maxsize=16)
-def _negative(name: str, unit: str | None) -> Part:
-    """Load a part, once per process, so that messages about its mesh appear once."""
+def _negative(name: str, unit: str | None, modified: int) -> Part:
+    """Load a part, once per process, so that messages about its mesh appear once.
+
+    A file with another modification time ``modified`` (nanoseconds) is read again.
+    """
     return load_part(name, unit)
+
+
+def _modification_time(name: str) -> int:
+    """Return the modification time of a part's file, nanoseconds; 0 for a built-in part."""
+    path = Path(name)
+    return path.stat().st_mtime_ns if path.is_file() else 0
 
 
 @lru_cache(maxsize=1)

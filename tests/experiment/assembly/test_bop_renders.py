@@ -1,6 +1,8 @@
 """``data=bop_renders``: train on renders of BOP models and evaluate on the real images."""
 
 import json
+import math
+import os
 import re
 import shutil
 
@@ -103,6 +105,21 @@ def test_models_outside_data_objects_are_negatives(config):
     assert [part.name for part in factory.parts] == ["red"]
     assert factory.negatives[0].name == "blue"
     assert build_negatives(given.data, parts)[0] is factory.negatives[0]  # read once
+
+
+def test_a_listed_negative_is_read_again_only_after_a_change(config, tmp_path):
+    path = tmp_path / "other.stl"
+    trimesh.creation.box((20.0, 30.0, 40.0)).export(path)
+    given = config(f"virtual.negatives=[{path}]", "data.unit=mm", "data.objects=[red]")
+    parts = build_parts(given.data)
+    first = build_negatives(given.data, parts)[0]
+    assert build_negatives(given.data, parts)[0] is first
+    trimesh.creation.box((20.0, 30.0, 50.0)).export(path)
+    os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+    second = build_negatives(given.data, parts)[0]
+    assert (first.diameter, second.diameter) == pytest.approx(
+        (math.hypot(0.02, 0.03, 0.04), math.hypot(0.02, 0.03, 0.05))
+    )
 
 
 def test_validation_renders_of_a_checkpoint_do_not_need_the_data_set(config, tmp_path):
