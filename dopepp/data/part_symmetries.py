@@ -18,7 +18,7 @@ from dopepp.core.json import read_json
 from dopepp.data.formats.bop import bop_models
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
-from dopepp.parts.symmetry_finder import TOLERANCE, find_symmetries
+from dopepp.parts.symmetry_finder import LARGEST_TOLERANCE, TOLERANCE, find_symmetries
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +27,9 @@ NONE: Final = "none"
 
 
 def choose_symmetries(
-    parts: Sequence[Part], choice: str | Mapping[str, object] | None
+    parts: Sequence[Part],
+    choice: str | Mapping[str, object] | None,
+    resolution: float = 0.0,
 ) -> list[Part]:
     """Return the parts with the symmetries that ``choice`` names.
 
@@ -36,6 +38,8 @@ def choose_symmetries(
         choice: None keeps the parts' symmetries; ``none`` removes them; ``auto`` finds them on the
             mesh. Another text is the path of a file with an entry for each part, by name. A mapping
             has entries by name for some parts, and keeps the symmetries of the others.
+        resolution: Smallest movement of the surface that a camera shows, metres. ``auto`` permits
+            this distance from the surface, if it exceeds the default tolerance.
 
     Raises:
         UserError: A file or an entry is missing or wrong, or a part has no mesh for ``auto``.
@@ -45,7 +49,11 @@ def choose_symmetries(
     if choice == NONE:
         return [replace(part, symmetries_discrete=None, symmetries_continuous=()) for part in parts]
     if choice == AUTO:
-        return [with_symmetries(part) for part in parts]
+        visible = [min(resolution / part.diameter, LARGEST_TOLERANCE) for part in parts]
+        return [
+            with_symmetries(part, max(TOLERANCE, tolerance))
+            for part, tolerance in zip(parts, visible, strict=True)
+        ]
     if isinstance(choice, Mapping):
         entries = {name: bop_models.parse_symmetries(name, entry) for name, entry in choice.items()}
     else:

@@ -80,26 +80,26 @@ def choose_keypoints(
 ) -> Keypoints:
     """Return the keypoints (input pixels) of each instance in the equivalent pose to train on.
 
-    The default is the pose nearest to the reference orientation. An allowed alternative is used if
-    its maps have a lower loss against the network's ``stages``; instances are decided in sequence.
+    Among the allowed poses, the one whose own maps have the lowest loss against the network's
+    ``stages`` is chosen; without stages, the pose nearest to the reference orientation.
     """
     choices, allowed = symmetry.equivalents(batch)
     keypoints = choices[:, :, 0].clone()
     if stages is None:
         return keypoints
-    for slot, choice in allowed[:, :, 1:].any(dim=0).nonzero().tolist():
-        # Draw maps only for images on which this choice is allowed for the instance.
-        rows = allowed[:, slot, 1 + choice].nonzero()[:, 0]
-        images = batch.rows(rows)
+    is_open = allowed[:, :, 1:].any(dim=-1) & (batch.visible_fraction >= MIN_VISIBLE_FRACTION)
+    index = is_open.nonzero()
+    # As many maps as the batch has images at a time, for bounded memory.
+    for rows, slots in (part.unbind(-1) for part in index.split(len(batch))):
         outputs = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
-        other = keypoints[rows]
-        other[:, slot] = choices[rows, slot, 1 + choice]
-        present_loss, other_loss = (
-            loss.per_image(outputs, *draw_maps(images, points, symmetry.num_objects, geometry))
-            for points in (keypoints[rows], other)
-        )
-        is_better = other_loss < present_loss
-        keypoints[rows] = torch.where(is_better[:, None, None, None], other, keypoints[rows])
+        map_size = outputs[0][0].shape[-2:]
+        objects = batch.object_index[rows, slots, None]
+        losses = []
+        for choice in choices[rows, slots].unbind(1):
+            maps = encode(choice[:, None], objects, symmetry.num_objects, map_size, geometry)
+            losses.append(loss.per_image(outputs, *maps))
+        best = torch.stack(losses, -1).where(allowed[rows, slots], torch.inf).argmin(-1)
+        keypoints[rows, slots] = choices[rows, slots, best]
     return keypoints
 
 

@@ -19,6 +19,15 @@ def stl(tmp_path):
     return path
 
 
+def test_auto_ignores_differences_that_a_camera_does_not_show(tmp_path):
+    path = tmp_path / "prism.stl"
+    trimesh.creation.box((30.0, 10.0, 10.8)).export(path)  # square but for 0.4 mm on each side
+    part = load_part(path, "mm")
+    for resolution, expected in ((0.0003, 3), (0.0006, 7)):
+        (result,) = choose_symmetries([part], "auto", resolution)
+        assert len(result.symmetries_discrete) == expected
+
+
 def test_the_command_prints_an_entry_that_training_reads(stl, tmp_path):
     result = CliRunner().invoke(app, ["symmetries", str(stl), "--unit", "mm"])
     assert result.exit_code == 0

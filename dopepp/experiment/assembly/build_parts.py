@@ -27,8 +27,13 @@ PAPER_OBJECTS: Final = (
 
 
 def build_parts(data: DataConfig) -> list[Part]:
-    """Load the parts to learn, from ``data.root`` or ``data.parts``, with their symmetries."""
-    return choose_symmetries(_read_parts(data), data.symmetries)
+    """Load the parts to learn, from ``data.root`` or ``data.parts``, with their symmetries.
+
+    With a camera and ``data.symmetries=auto``, a part may differ from its rotated copy by a pixel.
+    """
+    view = data.virtual.view
+    resolution = 0.0 if view is None else view.resolution
+    return choose_symmetries(_read_parts(data), data.symmetries, resolution)
 
 
 def _read_parts(data: DataConfig) -> list[Part]:

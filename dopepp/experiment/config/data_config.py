@@ -151,7 +151,8 @@ class DataConfig:
         parts: Built-in names or mesh files; used without a root and for NDDS.
         unit: Unit of the mesh files: m, cm, mm or inch; None: m for GLB, as stated in 3MF, else mm.
         symmetries: Symmetries of the objects: None for the data set's symmetries, ``none``,
-            ``auto``, a file, or symmetries by object name (:mod:`dopepp.data.part_symmetries`).
+            ``auto`` (within 1 % of the diameter or a pixel of ``virtual.camera``), a file, or
+            symmetries by object name (:mod:`dopepp.data.part_symmetries`).
         real_fraction: Share of labelled images in an epoch.
         synthetic_fraction: Share of YCB-Video's synthetic images among the unlabelled images.
         frames: Frames of YCB-Video for training and test, instead of image sets.

@@ -66,6 +66,11 @@ class View:
             fix = "write working_distance=[{1:g},{0:g}]".format(*self.distance)
             raise UserError(f"working_distance={list(self.distance)}", allowed, fix)
 
+    @property
+    def resolution(self) -> float:
+        """Length of a pixel at the geometric mean of the working distances, metres."""
+        return math.sqrt(math.prod(self.distance)) / focal_length(self.K)
+
     def sizes_px(self, parts: Sequence[Part], scale: float = 1.0) -> tuple[float, float]:
         """Return the smallest and largest diameter at any distance, in pixels times ``scale``."""
         diameters = [part.diameter for part in parts]
