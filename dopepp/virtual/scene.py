@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int16
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.parts.part import Part
 from dopepp.virtual.sensor import Sensor
 from dopepp.virtual.surface import Surface
@@ -87,15 +87,64 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Panel:
+    """A distant lamp tube or window with soft edges, which metals mirror.
+
+    The radiance in direction x is exp(−½ (a²/width² + b²/length²)) times ``intensity``, with the
+    components a across and b along the panel, and falls to 0 behind the camera's half space of x.
+
+    Attributes:
+        middle: Unit vector to the panel's middle, camera frame.
+        along: Unit vector of its longer side, perpendicular to ``middle``.
+        width: Standard deviation across the panel, as the sine of an angle.
+        length: Standard deviation along the panel, likewise.
+        intensity: Linear RGB radiance of the middle; a white surface under uniform light has 1.
+    """
+
+    middle: Triple
+    along: Triple
+    width: float
+    length: float
+    intensity: Triple
+
+    @property
+    def across(self) -> Vector:
+        """Unit vector across the panel."""
+        return np.cross(self.along, self.middle)
+
+    @property
+    def light(self) -> Vector:
+        """Light on a white surface that faces the panel, linear RGB."""
+        return 2 * self.width * self.length * np.array(self.intensity)
+
+
+@dataclass(frozen=True)
 class Ambient:
     """Ambient light: linear RGB of the upper hemisphere ``above`` and the lower ``below``.
 
-    ``up`` is a unit vector to the upper hemisphere, camera frame.
+    ``up`` is a unit vector to the upper hemisphere, camera frame. ``panels`` add to the light.
     """
 
     up: Triple = (0.0, -1.0, 0.0)
     above: Triple = (0.25, 0.25, 0.25)
     below: Triple = (0.12, 0.12, 0.12)
+    panels: tuple[Panel, ...] = ()
+
+    def light_on(self, normal: Vector) -> Vector:
+        """Return the light on a white surface with a unit normal and a free sky, linear RGB."""
+        above = 0.5 + 0.5 * float(np.dot(normal, self.up))
+        light = above * np.array(self.above) + (1 - above) * np.array(self.below)
+        for panel in self.panels:
+            light += max(float(np.dot(normal, panel.middle)), 0.0) * panel.light
+        return light
+
+    def rotated(self, R: RotationMatrix) -> Ambient:
+        """Return the light in another camera's frame."""
+        panels = (
+            replace(panel, middle=triple(R @ panel.middle), along=triple(R @ panel.along))
+            for panel in self.panels
+        )
+        return replace(self, up=triple(R @ self.up), panels=tuple(panels))
 
 
 @dataclass(frozen=True)
@@ -193,7 +242,7 @@ class Scene:
             background=background,
             objects=tuple(objects),
             lights=tuple(lights),
-            ambient=replace(self.ambient, up=triple(R @ self.ambient.up)),
+            ambient=self.ambient.rotated(R),
             plane=plane,
             T_cam_world=T_new_cam @ self.T_cam_world,
         )

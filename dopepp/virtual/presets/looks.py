@@ -15,7 +15,7 @@ from numpy.random import Generator
 
 from dopepp.core.validation import Checked, Pair, Range, Share, Span
 from dopepp.geometry.rotation import Vector, rotation_to_z
-from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Triple, triple
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, Triple, triple
 from dopepp.virtual.surface import Surface
 
 Shares = Annotated[Pair, Span(0.0, 1.0, "share")]
@@ -169,6 +169,10 @@ class Lighting(Checked):
         temperature_k: Colour temperature at a white balance of 6500 K; low is reddish.
         tint: Largest relative deviation of a colour channel from the lamp's colour.
         ground_share: Ratio of the light from below to the light from above.
+        num_panels: Number of distant lamp tubes and windows, which metals mirror.
+        panel_intensity: Radiance of a panel.
+        panel_width: Standard deviation across a panel, as the sine of an angle.
+        panel_length: Standard deviation along a panel, likewise.
     """
 
     num_lights: Annotated[tuple[int, int], Span(0, 8, "a count")] = (1, 3)
@@ -181,6 +185,10 @@ class Lighting(Checked):
     temperature_k: Annotated[Pair, Span(1667.0, 25000.0, "kelvin")] = (4000.0, 8500.0)
     tint: Annotated[float, Range(0.0, 0.9, "share")] = 0.06
     ground_share: Shares = (0.3, 0.9)
+    num_panels: Annotated[tuple[int, int], Span(0, 8, "a count")] = (0, 0)
+    panel_intensity: Intensity = (0.5, 4.0)
+    panel_width: Annotated[Pair, Span(0.03, 1.0, "sine")] = (0.04, 0.25)
+    panel_length: Annotated[Pair, Span(0.03, 1.0, "sine")] = (0.1, 0.7)
 
     def draw(
         self, rng: Generator, centre: Vector, normal: Vector | None = None
@@ -203,7 +211,22 @@ class Lighting(Checked):
             towards = towards / np.linalg.norm(towards)
         above = rng.uniform(*self.ambient_intensity) * self._colour(rng)
         below = above * rng.uniform(*self.ground_share)
-        return tuple(lights), Ambient(triple(towards), triple(above), triple(below))
+        panels: list[Panel] = []
+        if self.num_panels[1]:  # sample only if needed, so that other presets' images stay equal
+            count = int(rng.integers(self.num_panels[0], self.num_panels[1] + 1))
+            panels = [self._panel(rng, towards) for _ in range(count)]
+        ambient = Ambient(triple(towards), triple(above), triple(below), tuple(panels))
+        return tuple(lights), ambient
+
+    def _panel(self, rng: Generator, up: Vector) -> Panel:
+        """Sample a lamp tube or window in the upper hemisphere."""
+        middle = _in_cap(rng, up, 90.0)
+        right, across, _ = rotation_to_z(middle)
+        angle = rng.uniform(0, np.pi)
+        along = np.cos(angle) * right + np.sin(angle) * across
+        width, length = rng.uniform(*self.panel_width), rng.uniform(*self.panel_length)
+        intensity = rng.uniform(*self.panel_intensity) * self._colour(rng)
+        return Panel(triple(middle), triple(along), width, length, triple(intensity))
 
     def _colour(self, rng: Generator) -> Vector:
         """Sample the linear RGB of a lamp of luminance about 1."""

@@ -30,6 +30,7 @@ LAMP_SHARE: Final = 0.06  # a lamp's radius / its distance: a bulb of 6 cm at ha
 _MAX_ALBEDO: Final = 0.95  # a higher albedo would be unphysical and prolong paths
 _VERTEX_COLOUR: Final = "vertex_colour"
 _SKY_ROWS: Final = 64
+_PANEL_SKY_ROWS: Final = 256  # pixels of 0.7°, a third of the narrowest panel
 _NOISE_CELLS: Final = 64  # side of the repeating lattice of random albedos
 
 
@@ -186,14 +187,30 @@ def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
 
 
 def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
-    """Return Mitsuba's environment map, with one colour above and one below the horizon."""
-    pixels = np.empty((_SKY_ROWS, 2 * _SKY_ROWS, 3), np.float32)
-    pixels[: _SKY_ROWS // 2], pixels[_SKY_ROWS // 2 :] = ambient.above, ambient.below
+    """Return Mitsuba's environment map: a colour above and below the horizon, and the panels."""
+    rows = _PANEL_SKY_ROWS if ambient.panels else _SKY_ROWS
+    pixels = np.empty((rows, 2 * rows, 3), np.float32)
+    pixels[: rows // 2], pixels[rows // 2 :] = ambient.above, ambient.below
     up = np.array(ambient.up) / np.linalg.norm(ambient.up)
     right, across, up = rotation_to_z(up)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, up, -across], axis=1)  # Mitsuba's zenith is +y
+    for panel in ambient.panels:
+        directions = _sky_directions(rows) @ pose[:3, :3].T
+        front = np.clip(0.5 + 2 * directions @ np.array(panel.middle), 0.0, 1.0)
+        sideways = directions @ panel.across / panel.width
+        lengthways = directions @ np.array(panel.along) / panel.length
+        share = front * np.exp(-0.5 * (sideways**2 + lengthways**2))
+        pixels += (share[..., None] * panel.intensity).astype(np.float32)
     return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": mi.ScalarTransform4f(pose)}
+
+
+def _sky_directions(rows: int) -> Float[np.ndarray, "rows columns 3"]:
+    """Return the unit vectors to the pixels of an environment map, in Mitsuba's sky frame."""
+    polar = (np.arange(rows) + 0.5)[:, None] / rows * np.pi
+    azimuth = (np.arange(2 * rows) + 0.5) / rows * np.pi
+    x, z = np.sin(azimuth) * np.sin(polar), -np.cos(azimuth) * np.sin(polar)
+    return np.stack([x, np.broadcast_to(np.cos(polar), x.shape), z], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -238,9 +238,7 @@ class TableTop:
 
     def _full_light(self) -> Colours:
         """Return the linear radiance of a white plane without objects, in closed form."""
-        ambient = self._scene.ambient
-        above = 0.5 + 0.5 * float(self._normal @ np.array(ambient.up))
-        sky = above * np.array(ambient.above) + (1 - above) * np.array(ambient.below)
+        sky = self._scene.ambient.light_on(self._normal)
         light = np.broadcast_to(sky, self._points.shape).copy()
         for lamp in self._scene.lights:
             towards = np.array(lamp.position) - self._points

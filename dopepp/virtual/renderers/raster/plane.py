@@ -26,7 +26,6 @@ from dopepp.virtual.renderers.raster.visibility import (
     Box,
     Samples,
     ShadowMap,
-    ambient_row,
 )
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
@@ -82,12 +81,10 @@ def darken_plane(
         cast, margin = _soft_shadow(plane, shadow)
         to_map = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]]) @ shadow.P
         _warp(cast, to_map @ to_point, box, shade)
-    ambient = ambient_row(scene.ambient)
-    above = 0.5 + 0.5 * float(np.dot(plane.normal, ambient[:3]))
     lit = _LitPlane(
         to_point.astype(np.float32),
         np.array(plane.normal, np.float32),
-        np.asarray(above * ambient[3:6] + (1 - above) * ambient[6:], np.float32),
+        np.asarray(scene.ambient.light_on(np.array(plane.normal)), np.float32),
         np.array([shadow.light for shadow in lights], np.float32).reshape(-1, 6),
         np.array([shadow.P for shadow in lights], np.float32).reshape(-1, 3, 4),
     )

@@ -21,7 +21,13 @@ import numpy as np
 
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
-from dopepp.virtual.renderers.raster.visibility import Projection, Samples, ShadowMap, ambient_row
+from dopepp.virtual.renderers.raster.visibility import (
+    Projection,
+    Samples,
+    ShadowMap,
+    ambient_row,
+    panel_rows,
+)
 from dopepp.virtual.scene import NOISE_LIMITS, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.surface.occlusion import look_up_sky
@@ -69,6 +75,7 @@ def shade_object(
     look_up_sky(fragments.face, fragments.share, sky.steps, sky.firsts, sky.values, opened)
     ambient = ambient_row(scene.ambient)
     reflect_ambient(fragments, opened, ambient, material.metallic, radiance)
+    reflect_panels(fragments, opened, panel_rows(scene.ambient), material.metallic, radiance)
     for shadow in lights:
         lit = shadow.lit_shares(fragments.position, fragments.normal, fragments.bulge)
         specular, metallic = material.specular, material.metallic
@@ -252,6 +259,47 @@ def reflect_ambient(
             gloss = mirrored * ambient[3 + c] + (1.0 - mirrored) * ambient[6 + c]
             light = (1.0 - metallic) * scattered + metallic * gloss
             radiance[c, p] = opened[p] * albedo[c, p] * light
+
+
+@compiled(fastmath=True)
+def reflect_panels(
+    fragments: Fragments, opened: Array, panels: Array, metallic: float, radiance: Array
+) -> None:
+    """Add the light of distant panels: scattered by a dielectric, mirrored by a metal.
+
+    A GGX lobe of width α spreads a mirror image by √2 α along both axes.
+
+    Args:
+        fragments: Fragments of the object.
+        opened: Share of the ambient light that reaches each point.
+        panels: Result of :func:`panel_rows`.
+        metallic: 1 for metals, otherwise 0.
+        radiance: Linear RGB, increased in place.
+    """
+    position, normal = fragments.position, fragments.normal
+    albedo, alpha = fragments.albedo, fragments.alpha
+    for p in range(position.shape[1]):
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        px, py, pz = position[0, p], position[1, p], position[2, p]
+        inverse = 1.0 / math.sqrt(px * px + py * py + pz * pz)
+        turn = -2.0 * (nx * px + ny * py + nz * pz) * inverse
+        rx, ry, rz = px * inverse + turn * nx, py * inverse + turn * ny, pz * inverse + turn * nz
+        spread = 2.0 * alpha[p] * alpha[p]
+        for k in range(panels.shape[0]):
+            panel = panels[k]
+            width, length = panel[9], panel[10]
+            facing = nx * panel[0] + ny * panel[1] + nz * panel[2]
+            light = (1.0 - metallic) * 2.0 * width * length * max(facing, 0.0)
+            if metallic > 0.0:
+                front = 0.5 + 2.0 * (rx * panel[0] + ry * panel[1] + rz * panel[2])
+                along = rx * panel[3] + ry * panel[4] + rz * panel[5]
+                across = rx * panel[6] + ry * panel[7] + rz * panel[8]
+                wide, long = width * width + spread, length * length + spread
+                peak = width * length / math.sqrt(wide * long) * min(max(front, 0.0), 1.0)
+                distance = across * across / wide + along * along / long
+                light += metallic * peak * math.exp(-0.5 * distance)
+            for c in range(3):
+                radiance[c, p] += opened[p] * albedo[c, p] * light * panel[11 + c]
 
 
 @compiled(fastmath=True)

@@ -248,6 +248,15 @@ def ambient_row(ambient: Ambient) -> Array:
     return np.array([*ambient.up, *ambient.above, *ambient.below], np.float32)
 
 
+def panel_rows(ambient: Ambient) -> Array:
+    """Return middle, along, across, width, length and intensity of each panel, shape (n, 14)."""
+    rows = [
+        [*panel.middle, *panel.along, *panel.across, panel.width, panel.length, *panel.intensity]
+        for panel in ambient.panels
+    ]
+    return np.array(rows, np.float32).reshape(-1, 14)
+
+
 @compiled(fastmath=True)
 def _project_points(
     position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, out: Array

@@ -11,12 +11,13 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera import make_transform
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import Mesh, Part
 from dopepp.virtual import PRESETS, Factory, Rendered, make_surface, render
 from dopepp.virtual.renderers import find_renderer
-from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Plane, Scene, SceneObject
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, Plane, Scene, SceneObject
 
 pytestmark = pytest.mark.render
 
@@ -124,6 +125,28 @@ def test_a_shadow_falls_away_from_its_lamp(photoreal, box_part, scene_of):
     left, right = result.image[row, [columns[0] - 4, columns[-1] + 4]].mean(axis=1)
     assert right < 45 < left
     assert right == pytest.approx(expected.image[row, columns[-1] + 4].mean(), abs=15)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5])
+def test_a_metal_ball_mirrors_panels_where_the_rasteriser_does(photoreal, scene_of, roughness):
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=0.08)
+    ball = Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+    steel = Material((0.8, 0.8, 0.8), roughness=roughness, metallic=1.0)
+    pose = make_transform(np.eye(3), np.array([0.0, 0.0, 0.4]))
+    item = SceneObject(make_surface(ball), pose, steel)
+    right, above = np.array([0.8, 0.0, -0.6]), np.array([0.0, -0.6, -0.8])
+    panels = (
+        Panel(tuple(right), (0.0, 1.0, 0.0), 0.06, 0.4, (3.0, 1.0, 1.0)),
+        Panel(tuple(above), (1.0, 0.0, 0.0), 0.15, 0.15, (1.0, 1.0, 3.0)),
+    )
+    dim = Ambient((0, -1, 0), (0.05,) * 3, (0.05,) * 3, panels)
+    scene = scene_of(item, lights=(), ambient=dim)
+    result, expected = photoreal(scene), render(scene)
+    inside = cv2.erode((expected.instances == 0).astype(np.uint8), np.ones((5, 5))) > 0
+    first, other = (each.image[inside].astype(float) for each in (result, expected))
+    assert np.corrcoef(first[:, 0], other[:, 0])[0, 1] > 0.95
+    assert np.corrcoef(first[:, 2], other[:, 2])[0, 1] > 0.95
+    assert np.abs(first - other).mean() < 12
 
 
 def test_a_mirror_reflects_a_red_neighbour(photoreal, box_part, scene_of):

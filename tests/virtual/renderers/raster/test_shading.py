@@ -11,7 +11,7 @@ from dopepp.geometry.camera import make_transform, resize_camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.virtual import Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
-from dopepp.virtual.scene import Ambient, Grooves, Light, Material, SceneObject
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, SceneObject
 from dopepp.virtual.sensor import decode_srgb
 
 
@@ -135,6 +135,22 @@ def test_a_smooth_metal_mirrors_the_horizon(scene_of, tilted):
         for tilt in (0.5, -0.5)
     )
     assert abs(up - down) > 80
+
+
+def test_a_panel_has_its_radiance_in_a_mirror_and_its_solid_angle_on_chalk(scene_of, tilted):
+    panel = Panel((0, 0, -1), (1, 0, 0), 0.1, 0.3, (0.5, 0.5, 0.5))
+    sky = replace(even(0.0), panels=(panel,))
+    mirror = Material((0.8, 0.8, 0.8), roughness=0.05, metallic=1.0)
+    chalk = Material((0.8, 0.8, 0.8), roughness=1.0, specular=0.0)
+    tilt = 0.1  # radians; a ray along the normal's mirror image is at twice the angle
+    for material, angle, expected in (
+        (mirror, 0.0, 0.8 * 0.5),
+        (mirror, tilt, 0.8 * 0.5 * np.exp(-0.5 * (np.sin(2 * tilt) / 0.1) ** 2)),
+        (chalk, 0.0, 0.8 * 0.5 * 2 * 0.1 * 0.3),  # Gaussian of solid angle 2π · 0.1 · 0.3, over π
+    ):
+        scene = scene_of(tilted(material, angle), lights=(), ambient=sky)
+        code = render(scene).image[60, 79, 0]
+        assert linear(code) == pytest.approx(expected, rel=0.05, abs=0.002)
 
 
 @pytest.mark.parametrize("irregularity", [0.0, 1.0])
