@@ -11,7 +11,7 @@ import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -65,7 +65,8 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
 
     Args:
         root: Folder of the data set.
-        objects: Names in the requested order (default: all objects with a file, by number).
+        objects: Names, or stems of the model files (``obj_000001``), in the requested order
+            (default: all objects with a file, by number).
 
     Raises:
         UserError: The folder has no models, or a name is unknown.
@@ -76,17 +77,20 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
         fix = "set data.root to the root folder, or unpack the data set's models into it"
         raise UserError(problem, "the root folder of a BOP data set", fix)
     by_name = {info.name: info for info in infos.values()}
+    # A part that was trained from the data set's own mesh file is named after the file.
+    by_stem = {info.path.stem: replace(info, name=info.path.stem) for info in infos.values()}
     if objects is None:
         present = objects_with_model(infos)
         absent = [info.name for number, info in infos.items() if number not in present]
         if absent:
             _log.warning("%s: ignoring models without a file: %s", root, ", ".join(absent))
         objects = [info.name for number, info in infos.items() if number in present]
+    known = by_stem | by_name
     for name in objects:
-        if name not in by_name:
+        if name not in known:
             problem, allowed = f"data.objects with {name!r}", ", ".join(by_name)
             raise UserError(problem, allowed, "set data.objects to one or more of these names")
-    return [read_part(by_name[name]) for name in objects]
+    return [read_part(known[name]) for name in objects]
 
 
 def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
@@ -96,10 +100,13 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
         UserError: A part is not in ``models_info.json``. If this file is missing, the part's name
             is not of the form ``obj_000001``.
     """
-    names = {info.name: number for number, info in read_models(root).items()}
+    infos = read_models(root)
+    names = {info.name: number for number, info in infos.items()}
+    stems = {info.path.stem: number for number, info in infos.items()}
     numbered: dict[int, Part] = {}
     for part in parts:
-        number = names.get(part.name) if names else number_in_name(part.name)
+        stated = names.get(part.name, stems.get(part.name))
+        number = stated if infos else number_in_name(part.name)
         if number is None:
             raise UserError(
                 f"part {part.name!r}, which is not in the data set {root}",

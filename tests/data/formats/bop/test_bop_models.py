@@ -53,6 +53,15 @@ def test_written_parts_are_read_with_symmetries_in_metres(tmp_path):
     assert [part.name for part in bop_parts(tmp_path, ["servoholder"])] == ["servoholder"]
 
 
+def test_a_part_may_be_named_after_its_model_file(tmp_path):
+    write_models(tmp_path, [pivconnector(), servoholder()])
+    (part,) = bop_parts(tmp_path, ["obj_000002"])
+    (named,) = bop_parts(tmp_path, ["servoholder"])
+    assert (part.name, part.mesh_hash) == ("obj_000002", named.mesh_hash)
+    assert parts_by_id(tmp_path, [part]) == {2: part}
+    assert parts_by_id(tmp_path, [named]) == {2: named}
+
+
 def test_ply_is_read_by_trimesh_in_millimetres(tmp_path):
     write_models(tmp_path, [pivconnector()])
     path = tmp_path / "models" / "obj_000001.ply"
