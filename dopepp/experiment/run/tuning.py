@@ -19,7 +19,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import compress
+from itertools import accumulate, compress
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -74,6 +74,9 @@ MIN_REFINED_FACTOR: Final = 0.5
 input size, and make covariances too small on larger images and on real images."""
 
 MIN_REFINED: Final = 20  # smallest number of correct poses that determine a covariance factor
+
+MAX_INSTANCES: Final = 500
+"""Number of instances per part on which tuning fits and measures: heaps need only few images."""
 
 MAX_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
 SAME: Final = 0.005  # largest decrease of the average precision with fitted factors
@@ -164,7 +167,8 @@ def tune(
     old, cache = estimator.recovery, TuningCache()
     estimator = cache.with_cached_maps(estimator)
     count, rate = target.num_empty, target.false_positive_rate
-    validation, test = (cache.of(held_out_source(data, parts, split)) for split in HELD_OUT)
+    most = MAX_INSTANCES * len(parts)
+    validation, test = (cache.of(held_out_source(data, parts, split), most) for split in HELD_OUT)
     empty, empty_test = (cache.of(negative_frames(data, parts, split, count)) for split in HELD_OUT)
     plain = _without_refinement(estimator)
     _log.info("tuning: measuring on %d test images and %d without objects", len(test), count)
@@ -537,9 +541,20 @@ class TuningCache:
             self._items[key] = item
         return item
 
-    def of(self, source: SampleSource) -> SampleSource:
-        """Return a source that caches its items of epoch 0."""
-        return _CachedSource(source, self, source.name)
+    def of(self, source: SampleSource, max_instances: int | None = None) -> SampleSource:
+        """Return a source that caches its items of epoch 0.
+
+        The source ends with the image that reaches ``max_instances`` evaluated instances.
+        """
+        cached = _CachedSource(source, self, source.name, len(source))
+        if max_instances is not None:
+            counts = (
+                sum(map(is_evaluated, cached.sample(index).instances))
+                for index in range(len(source))
+            )
+            reached = (n for n, total in enumerate(accumulate(counts), 1) if total >= max_instances)
+            cached.length = next(reached, len(source))
+        return cached
 
     def with_cached_maps(self, estimator: PoseEstimator) -> PoseEstimator:
         """Return a copy of an estimator that caches the network's maps of each input."""
@@ -550,14 +565,15 @@ class TuningCache:
 
 @dataclass
 class _CachedSource:
-    """Source whose items of epoch 0 are cached."""
+    """The first ``length`` items of a source, of which items of epoch 0 are cached."""
 
     source: SampleSource
     cache: TuningCache
     name: str
+    length: int
 
     def __len__(self) -> int:
-        return len(self.source)
+        return self.length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return an item; items of epoch 0 come from the cache if possible."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from dopepp.data.sample import Instance, Sample
@@ -47,6 +48,14 @@ def test_items_of_a_source_are_cached_up_to_the_limit():
     assert (0, 1) in source.requests
     other_cached.sample(0)
     assert other.requests == [(0, 0)]  # items of other sources are separate
+
+
+@pytest.mark.parametrize(("most", "length"), [(1, 1), (2, 2), (3, 3), (9, 3)])
+def test_a_source_ends_when_it_has_enough_instances(most, length):
+    source = Noise()
+    cached = TuningCache().of(source, most)
+    assert len(cached) == length
+    assert source.requests == [(index, 0) for index in range(length)]
 
 
 def test_a_network_runs_once_per_image(tiny_spec):
