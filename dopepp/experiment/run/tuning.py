@@ -33,7 +33,8 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import LOOKALIKES, negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
-from dopepp.geometry.camera import project
+from dopepp.geometry.camera import make_transform, project
+from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.inference.runtimes import Runtime
@@ -274,7 +275,8 @@ class WrongFocalLengths:
     The relative error of the focal length is uniformly distributed up to the scale error that
     refinement assumes. With exact cameras, covariances would be fitted to errors smaller than those
     of any real camera. The principal point moves too, so that the line of sight to the first object
-    is unchanged. The error then changes only the object's distance, like an error of its size.
+    is unchanged. The other objects are rotated about the camera onto their lines of sight. The
+    error then changes only the objects' distances, like an error of their size.
     """
 
     def __init__(self, source: SampleSource) -> None:
@@ -289,10 +291,21 @@ class WrongFocalLengths:
         error = np.random.default_rng(index).uniform(-SCALE_ERROR, SCALE_ERROR)
         K = sample.K.copy()
         K[[0, 1], [0, 1]] *= 1.0 + error
-        if sample.instances:
-            pixel = project(sample.instances[0].T_cam_obj[None, :3, 3], sample.K)[0]
-            K[:2, 2] -= error * (pixel - sample.K[:2, 2])
-        return replace(sample, K=K)
+        if not sample.instances:
+            return replace(sample, K=K)
+        centres = np.array([instance.T_cam_obj[:3, 3] for instance in sample.instances])
+        pixels = project(centres, sample.K)
+        K[:2, 2] -= error * (pixels[0] - sample.K[:2, 2])
+        instances = [sample.instances[0]]
+        for instance, centre, pixel in zip(
+            sample.instances[1:], centres[1:], pixels[1:], strict=True
+        ):
+            ray = np.linalg.solve(K, [*pixel, 1.0])
+            # The angle is so small that it equals its sine.
+            turn = np.cross(centre, ray) / (np.linalg.norm(centre) * np.linalg.norm(ray))
+            rotation = make_transform(rotation_vector_to_matrix(turn), np.zeros(3))
+            instances.append(replace(instance, T_cam_obj=rotation @ instance.T_cam_obj))
+        return replace(sample, K=K, instances=instances)
 
 
 def fit_refined_factor(estimator: PoseEstimator, parts: Parts, source: SampleSource) -> float:

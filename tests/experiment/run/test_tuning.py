@@ -227,20 +227,28 @@ def test_the_focal_length_is_wrong_by_up_to_the_scale_error():
     assert again[1, 1] / K[1, 1] == pytest.approx(again[0, 0] / K[0, 0])
 
 
-def test_a_wrong_focal_length_keeps_the_line_of_sight_to_a_part_beside_the_axis():
+def test_a_wrong_focal_length_keeps_the_pixels_and_distances_of_parts_beside_the_axis():
     class Beside(Many):
         def sample(self, index: int, epoch: int = 0) -> Sample:
             sample = super().sample(index, epoch)
-            T = POSE.copy()
-            T[:3, 3] += (0.2, -0.1, 0.0)
-            return replace(sample, instances=[replace(sample.instances[0], T_cam_obj=T)])
+            poses = [POSE.copy() for _ in range(3)]
+            for T, shift in zip(
+                poses, ((0.2, -0.1, 0.0), (-0.3, 0.1, 0.2), (0, 0, 0)), strict=True
+            ):
+                T[:3, 3] += shift
+            instances = [replace(sample.instances[0], T_cam_obj=T) for T in poses]
+            return replace(sample, instances=instances)
 
     right, wrong = Beside(4).sample(3), WrongFocalLengths(Beside(4)).sample(3)
     assert wrong.K[0, 0] != right.K[0, 0]
-    center = right.instances[0].T_cam_obj[:3, 3]
-    pixel = right.K @ center / center[2]
-    seen = np.linalg.inv(wrong.K) @ pixel
-    assert_allclose(seen / seen[2], center / center[2], atol=1e-12)
+    assert_array_equal(wrong.instances[0].T_cam_obj, right.instances[0].T_cam_obj)
+    for before, after in zip(right.instances, wrong.instances, strict=True):
+        center, turned = before.T_cam_obj[:3, 3], after.T_cam_obj[:3, 3]
+        pixel, seen = right.K @ center / center[2], wrong.K @ turned / turned[2]
+        assert_allclose(seen, pixel, atol=1e-4)
+        assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(center))
+        rotation = after.T_cam_obj[:3, :3] @ before.T_cam_obj[:3, :3].T
+        assert_allclose(rotation @ center, turned, atol=1e-12)
 
 
 def test_few_refined_poses_keep_their_covariances(caplog):
