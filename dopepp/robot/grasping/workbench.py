@@ -18,13 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import Transform, invert_transform, make_transform
+from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
 from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body, distractor_shapes, make_body
+from dopepp.virtual.physics import settle
 from dopepp.virtual.presets import PRESETS
 from dopepp.virtual.presets.table import Table, plane_of
 from dopepp.virtual.renderers import find_renderer
@@ -140,10 +141,19 @@ class Layout:
         return solids
 
     def heap(self, rng: Generator) -> list[PlacedSolid]:
-        """Sample 3 to 5 parts at increasing heights, which fall onto each other."""
+        """Sample 3 to 5 parts above each other, and let them fall onto each other."""
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
-        heights = [0.002 + 0.02 * index for index in range(count)]
-        return [self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
+        poses = None
+        while poses is None:  # rarely, parts do not come to rest or overlap
+            falling: list[PlacedSolid] = []
+            height = DROP_HEIGHT
+            for _ in range(count):
+                falling.append(self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT))
+                corners = transform(falling[-1].T_base_obj, self.body.hull.vertices)
+                height = float(corners[:, 2].max()) + DROP_HEIGHT
+            starts = np.stack([item.T_base_obj for item in falling])
+            poses = settle([self.body.pieces] * count, starts, (), self.part.diameter)
+        return [replace(item, T_base_obj=pose) for item, pose in zip(falling, poses, strict=True)]
 
 
 def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:

@@ -13,7 +13,8 @@ from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _sample_path
 from dopepp.robot.grasping.grasp_trial import PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
-from dopepp.robot.grasping.planner import align_with_bench
+from dopepp.robot.grasping.planner import LOW, align_with_bench
+from dopepp.robot.grasping.selection import EstimatedPart
 
 
 @pytest.fixture
@@ -32,7 +33,8 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
 
 
 def test_a_part_at_another_pose_is_not_caught(trials, scene, monkeypatch):
-    aside = [pose @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for pose in scene.targets]
+    shift = make_transform(np.eye(3), [0.0, 0.05, 0.0])
+    aside = [EstimatedPart(pose @ shift) for pose in scene.targets]
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation(aside, scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert not record.caught
@@ -93,7 +95,7 @@ def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is
     flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
     tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     estimate = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
-    aligned = align_with_bench(estimate, trials.layout.body.hull, bench)
+    aligned = align_with_bench(estimate, trials.layout.body.hull, bench, LOW["single"])
     if is_aligned:
         np.testing.assert_allclose(aligned[:3, 2], [0, 0, 1], atol=1e-9)
         assert aligned[2, 3] == pytest.approx(0.0235, abs=1e-9)
