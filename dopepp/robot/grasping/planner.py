@@ -8,7 +8,7 @@ Inverse kinematics (by mink) takes differential steps within the joints' limits.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Final
 
@@ -44,6 +44,7 @@ PENETRATION: Final = 1e-4  # minimum penetration of a collision of the robot, me
 CARRIED: Final = 1e-3  # minimum penetration of a collision of the carried part, metres
 LIFT_CHECKS: Final = 25  # collision checks of a lift: every 5 mm
 DISTURBING: Final = 0.3  # factor on the quality of a grasp whose lift moves other objects
+SHALLOW: Final = 0.2  # smallest factor on the quality of a grasp less than 3 mm deep
 SHIFT: Final = 0.002  # displacements of the hand for the margin of a grasp, metres
 
 
@@ -218,11 +219,12 @@ class Planner:
             closes and lifts without a collision, or None.
         """
         self._place(poses)
-        for tilt, grasp in product(self._tilts, grasps):
-            for tool in self._tools(poses[0], grasp, tilt):
+        for tilt, insertion, grasp in product(self._tilts, INSERTIONS, grasps):
+            for tool, depth in self._tools(poses[0], grasp, tilt, insertion):
                 motion = self._motion(poses[0], tool, grasp, start)
                 if motion is not None:
-                    return motion
+                    grip = max(SHALLOW, min(depth / INSERTIONS[1], 1.0))
+                    return replace(motion, quality=motion.quality * grip)
         return None
 
     def can_move(self, poses: Sequence[Transform], start: Joints, end: Joints) -> bool:
@@ -238,10 +240,14 @@ class Planner:
             else:
                 self._cell.put_away(self._state, number)
 
-    def _tools(self, T_base_obj: Transform, grasp: Grasp, tilt: float) -> Iterator[Transform]:
-        """Yield T_base_tool, the pads' ends, for a grasp and its half turn, the deepest pose first.
+    def _tools(
+        self, T_base_obj: Transform, grasp: Grasp, tilt: float, insertion: float
+    ) -> Iterator[tuple[Transform, float]]:
+        """Yield T_base_tool of the pads' ends and their depth for a grasp and its half turn.
 
-        A pose is omitted if it is tilted by more than :data:`STEEPEST` or touches the bench.
+        The depth beyond the grasp's point is ``insertion``, or for the largest insertion as much as
+        the bench allows, metres. A pose is omitted if it is tilted by more than :data:`STEEPEST` or
+        touches the bench.
         """
         up = self.knowledge.T_base_bench[:3, 2]
         half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
@@ -254,9 +260,9 @@ class Planner:
                 continue
             points = ends @ T[:3, :3].T + T[:3, 3] - self.knowledge.T_base_bench[:3, 3]
             room = (float((points @ up).min()) - ABOVE_BENCH) / steep
-            if room >= 0:
-                for depth in sorted({min(room, depth) for depth in INSERTIONS}, reverse=True):
-                    yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
+            if room >= 0 and (insertion < room or insertion == INSERTIONS[0]):
+                depth = min(room, insertion)
+                yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2]), depth
 
     def _motion(
         self, T_base_obj: Transform, T_base_tool: Transform, grasp: Grasp, start: Joints

@@ -37,6 +37,7 @@ SPREAD: Final = 0.025  # radius of the circle in which a part's centre is sample
 DROP_HEIGHT: Final = 0.0005  # initial height of objects above the bench, metres
 HEAP: Final = (3, 5)  # minimum and maximum number of parts in a heap
 HEAP_SPREAD: Final = 0.05  # radius within which parts of a heap fall, metres
+HEAP_TRIALS: Final = 8  # number of heaps that are dropped until one comes to rest
 HEAP_TILT: Final = 15.0  # largest initial tilt of a falling part, degrees
 DISTRACTORS: Final = (2, 4)  # smallest and largest number of distractors
 DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of a distractor's radius, metres
@@ -141,10 +142,13 @@ class Layout:
         return solids
 
     def heap(self, rng: Generator) -> list[PlacedSolid]:
-        """Sample 3 to 5 parts above each other, and let them fall onto each other."""
+        """Sample 3 to 5 parts above each other, and let them fall onto each other.
+
+        Raises:
+            UserError: The parts do not come to rest.
+        """
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
-        poses = None
-        while poses is None:  # rarely, parts do not come to rest or overlap
+        for _ in range(HEAP_TRIALS):
             falling: list[PlacedSolid] = []
             height = DROP_HEIGHT
             for _ in range(count):
@@ -153,7 +157,12 @@ class Layout:
                 height = float(corners[:, 2].max()) + DROP_HEIGHT
             starts = np.stack([item.T_base_obj for item in falling])
             poses = settle([self.body.pieces] * count, starts, (), self.part.diameter)
-        return [replace(item, T_base_obj=pose) for item, pose in zip(falling, poses, strict=True)]
+            if poses is not None:
+                placed = zip(falling, poses, strict=True)
+                return [replace(item, T_base_obj=pose) for item, pose in placed]
+        problem = f"a heap of part {self.part.name}, which does not come to rest"
+        allowed = "parts that do not roll on the bench"
+        raise UserError(problem, allowed, "pass --layout single or distractors")
 
 
 def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:

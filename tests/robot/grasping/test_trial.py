@@ -13,7 +13,7 @@ from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _sample_path
 from dopepp.robot.grasping.grasp_trial import PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
-from dopepp.robot.grasping.planner import LOW, align_with_bench
+from dopepp.robot.grasping.planner import DISTURBING, LOW, align_with_bench
 from dopepp.robot.grasping.selection import EstimatedPart
 
 
@@ -104,16 +104,38 @@ def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is
         np.testing.assert_array_equal(aligned, estimate)
 
 
-def test_a_plan_avoids_another_part(trials, part):
-    knowledge = trials.robot(0)[1].knowledge
-    scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=knowledge))
-    crowded = Trials(replace(trials.task, layout="heap"))
-    planner = crowded._planner(scene)
-    lower = make_transform(np.eye(3), TRAY + np.array([0, 0, 0.0035]))
+@pytest.fixture(scope="module")
+def crowded(trials):
+    """A planner for heaps."""
+    scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=trials.robot(0)[1].knowledge))
+    return Trials(replace(trials.task, layout="heap"))._planner(scene)
+
+
+LOWER = make_transform(np.eye(3), TRAY + np.array([0, 0, 0.0035]))
+ACROSS = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
+
+
+def test_a_plan_avoids_another_part(crowded):
     over = make_transform(np.eye(3), TRAY + np.array([0, 0.02, 0.012]))
-    across = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
-    assert planner.plan([lower], across, HOME) is not None
-    assert planner.plan([lower, over], across, HOME) is None
+    assert crowded.plan([LOWER], ACROSS, HOME) is not None
+    assert crowded.plan([LOWER, over], ACROSS, HOME) is None
+
+
+def test_closing_fingers_stay_above_a_part_that_sticks_out_below(crowded, trials):
+    # The lower part is beside the open fingers, but between the closed fingers.
+    above = make_transform(np.eye(3), TRAY + np.array([0, 0.004, 0.0106]))
+    plan = crowded.plan([above, LOWER], ACROSS, HOME)
+    ends = trials.arm.flange(plan.descent[-1])[2, 3] - trials.gripper.reach(plan.grasp.width)
+    assert 0.007 < ends < 0.0106
+
+
+def test_a_lift_that_moves_a_part_on_top_reduces_the_quality(crowded):
+    left = [replace(ACROSS[0], point=np.array([-0.02, 0, 0]))]
+    crossed = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    on_top = make_transform(crossed, TRAY + np.array([0.045, 0, 0.0107]))
+    free, loaded = (crowded.plan(poses, left, HOME) for poses in ([LOWER], [LOWER, on_top]))
+    assert free.quality > 0.9
+    assert loaded.quality == pytest.approx(DISTURBING * free.quality, rel=0.01)
 
 
 def test_a_motion_passes_its_waypoints_from_rest_to_rest(scene):
