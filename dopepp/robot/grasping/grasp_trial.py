@@ -280,18 +280,21 @@ class Trials:
     def attempts(self, scene: TrialScene, source: PoseSource) -> Iterator[Attempt]:
         """Yield the attempts of a trial: one, or for a heap as many as it takes to empty the heap.
 
-        A heap gets at most :data:`EXTRA_ATTEMPTS` more attempts than it has parts. Before each
-        attempt the camera takes a new image.
+        A heap gets at most :data:`EXTRA_ATTEMPTS` more attempts than it has parts, and is given up
+        when two successive attempts find no plan. Before each attempt the camera takes a new image.
         """
         limit = len(scene.parts) + EXTRA_ATTEMPTS if self.task.layout == "heap" else 1
         failed: list[Transform] = []
+        failure = ""
         while True:
             attempt = self.attempt(scene, source, failed)
             yield attempt
             is_empty = len(attempt.outcome.lifted) == len(scene.parts)
-            if is_empty or scene.attempt == limit:
+            is_stuck = failure == attempt.record.failure == "no plan"
+            if is_empty or is_stuck or scene.attempt == limit:
                 return
-            if attempt.record.failure and attempt.estimate is not None:
+            failure = attempt.record.failure
+            if failure and attempt.estimate is not None:
                 failed.append(attempt.estimate)
             scene = self._look_again(attempt)
 

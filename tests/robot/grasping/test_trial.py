@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _sample_path
-from dopepp.robot.grasping.grasp_trial import PoseSource, SceneObservation, Trials
+from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
 from dopepp.robot.grasping.planner import DISTURBING, LOW, align_with_bench
 from dopepp.robot.grasping.selection import EstimatedPart
@@ -46,6 +46,41 @@ def test_no_estimated_pose_is_the_failure_not_seen(trials, scene, monkeypatch):
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation([], scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
+
+
+class Attempts(Trials):
+    """Trials of a heap of three parts whose attempts have given results."""
+
+    def __init__(self, *results):
+        self.task, self.results, self.failed = GraspTask(layout="heap"), list(results), []
+
+    def attempt(self, scene, source, failed=()):
+        failure, lifted = self.results.pop(0)
+        self.failed.append(len(failed))
+        record, outcome = SimpleNamespace(failure=failure), SimpleNamespace(lifted=(0,) * lifted)
+        return SimpleNamespace(scene=scene, record=record, outcome=outcome, estimate=np.eye(4))
+
+    def _look_again(self, attempt):
+        scene, lifted = attempt.scene, attempt.outcome.lifted
+        return SimpleNamespace(attempt=scene.attempt + 1, parts=scene.parts[len(lifted) :])
+
+
+@pytest.mark.parametrize(
+    ("results", "number"),
+    [
+        ([("", 1), ("slipped", 0), ("", 1), ("", 1), ("", 1)], 4),
+        ([("", 2), ("", 1), ("", 1)], 2),
+        ([("slipped", 0)] * 9, 6),
+        ([("no plan", 0), ("", 1), ("no plan", 0), ("no plan", 0), ("", 1)], 4),
+    ],
+    ids=["empty", "two parts at once", "no attempts left", "no plan twice"],
+)
+def test_a_heap_is_tried_until_it_is_empty_or_attempts_are_used_up(results, number):
+    trials = Attempts(*results)
+    attempts = list(trials.attempts(SimpleNamespace(attempt=1, parts=[0, 1, 2]), None))
+    assert len(attempts) == number
+    failures = [bool(failure) for failure, _ in results[:number]]
+    assert trials.failed == [sum(failures[:before]) for before in range(number)]
 
 
 def test_a_trial_depends_on_the_seed_alone(trials, scene):
