@@ -353,7 +353,7 @@ class Trials:
 
     def _planner(self, scene: TrialScene) -> Planner:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
-        tilts = TILTS if self.task.layout == "heap" else TILTS[:1]
+        tilts = TILTS.tolist() if self.task.layout == "heap" else [0.0]
         knowledge = scene.calibrated.knowledge
         return Planner(self.arm, self.gripper, self._parts_cell(count), knowledge, tilts)
 
@@ -418,19 +418,20 @@ class Trials:
     ) -> Record:
         """Return the result of an attempt; ``outcome`` is None if no plan was found."""
         robot = scene.calibrated
-        lifted = set() if outcome is None else set(scene.parts).intersection(outcome.lifted)
-        counts = (scene.attempt, len(scene.parts), len(lifted))
-        ends = (robot.hand_eye_mm, robot.hand_eye_deg, observation.second_view, *counts)
+        ends = (robot.hand_eye_mm, robot.hand_eye_deg, observation.second_view)
+        counts: dict[str, Any] = {"attempt": scene.attempt, "parts": len(scene.parts)}
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
             nan = float("nan")
-            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends)
+            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends, **counts)
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
         angle = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
         is_recognised = bool(add < RECOGNISED * self.part.diameter)
         is_caught = outcome is not None and outcome.held in scene.parts
+        if outcome is not None:
+            counts["lifted"] = len(set(scene.parts).intersection(outcome.lifted))
         if is_caught:
             failure = ""
         elif not is_recognised:
@@ -440,7 +441,7 @@ class Trials:
         else:
             failure = "collided" if outcome.collided else "slipped"
         pose = (1000 * add, 1000 * shift, angle)
-        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends)
+        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends, **counts)
 
     def _add(self, estimate: Transform, target: Transform) -> float:
         """Return the smallest ADD over the part's symmetries, metres."""

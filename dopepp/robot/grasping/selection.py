@@ -94,7 +94,7 @@ def choose_part(
         others = [*poses[:number], *poses[number + 1 :]]
         covered = covered_share(poses[number], others, points)
         shifts = (np.linalg.norm(pose[:3, 3] - poses[number][:3, 3]) for pose in failed)
-        failures = sum(shift < SAME for shift in shifts)
+        failures = sum(bool(shift < SAME) for shift in shifts)
         factors.append((part.probability, covered, failures))
     limits = [pick_score(chance, 1.0, covered, tried) for chance, covered, tried in factors]
     best: Choice | None = None
