@@ -30,7 +30,7 @@ def grasp(
     context: typer.Context,
     part: PartName = "pivconnector",
     unit: Unit = None,
-    count: Annotated[int, Option("-n", help="Number of grasps.")] = 200,
+    count: Annotated[int, Option("-n", help="Number of grasps, or of heaps.")] = 200,
     network: Annotated[
         str | None, Option(help="Checkpoint (default: the built-in part's release).")
     ] = None,

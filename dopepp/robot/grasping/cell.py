@@ -92,9 +92,13 @@ class Cell:
         state = mujoco.MjData(self.model)
         state.qpos[:JOINTS] = state.ctrl[:JOINTS] = HOME
         for number in range(self.count):
-            self.put(state, number, make_transform(np.eye(3), np.array([2.0, number, 0.5])))
+            self.put_away(state, number)
         mujoco.mj_forward(self.model, state)
         return state
+
+    def put_away(self, state: Any, number: int) -> None:
+        """Move solid ``number`` away from the bench in a MuJoCo state."""
+        self.put(state, number, make_transform(np.eye(3), np.array([2.0, number, 0.5])))
 
     def put(self, state: Any, number: int, T_base_obj: Transform) -> None:
         """Set the pose of solid ``number`` in a MuJoCo state, and its velocity to zero."""

@@ -34,7 +34,8 @@ FRAME_S: Final = 0.04  # interval of recorded states, seconds
 class Outcome:
     """Result of the arm's motions: held solid, collisions and recorded states."""
 
-    held: int | None = None  # index of the solid that was held after lifting and shaking
+    held: int | None = None  # index of the solid that was highest after lifting and shaking
+    lifted: tuple[int, ...] = ()  # indices of all solids that the gripper held then
     collided: bool = False  # whether the robot hit bench or solid before the fingers closed
     times: list[float] = field(default_factory=list)  # time of each recorded state, seconds
     states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)  # qpos of MuJoCo
@@ -69,7 +70,8 @@ class Execution:
     def run(self, plan: Plan) -> Outcome:
         """Execute a plan: approach, close the fingers, lift and shake.
 
-        The solid that rises most counts as held if it rises by more than 5 cm (`HELD_HEIGHT`).
+        A solid counts as lifted if it rises by more than 5 cm (`HELD_HEIGHT`); the one that rises
+        most counts as held.
         """
         heights_before = self._heights()
         self._command = self._gripper.command(plan.opening)
@@ -84,7 +86,8 @@ class Execution:
             self._advance(*joints)
         self._rest(plan.lift[-1])
         rises = self._heights() - heights_before
-        if len(rises) and rises.max() > HELD_HEIGHT:
+        self.outcome.lifted = tuple(np.flatnonzero(rises > HELD_HEIGHT).tolist())
+        if self.outcome.lifted:
             self.outcome.held = int(rises.argmax())
         return self.outcome
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,23 +39,22 @@ def show(
     """
     first = task.sources[0]
     failed = [record for record in records if record.failure and record.source == first.name]
-    examples = {record.failure: record.number for record in reversed(failed)}
+    examples = {record.failure: record for record in reversed(failed)}
     if not examples and video is None and rerun is None:
         return
     trials = Trials(task)
-    for failure, number in examples.items():
-        scene = trials.scene(number)
-        image = strip(trials, scene, trials.attempt(scene, first))
-        write_image(folder / f"{failure.replace(' ', '_')}.jpg", image)
+    for failure, record in examples.items():
+        attempts = trials.attempts(trials.scene(record.number), first)
+        attempt = next(islice(attempts, record.attempt - 1, None))
+        write_image(folder / f"{failure.replace(' ', '_')}.jpg", strip(trials, attempt))
     if video is not None or rerun is not None:
-        scene = trials.scene(0)
-        attempt = trials.attempt(scene, first)
+        attempt = trials.attempt(trials.scene(0), first)
         if video is not None and video.suffix == ".jpg":
-            write_image(video, strip(trials, scene, attempt))
+            write_image(video, strip(trials, attempt))
         elif video is not None:
-            write_video(video, trials, scene, attempt)
+            write_video(video, trials, attempt)
         if rerun is not None:
-            write_rerun(rerun, trials, scene, attempt)
+            write_rerun(rerun, trials, attempt)
 
 
 class SideView:
@@ -77,8 +77,9 @@ class SideView:
         return np.ascontiguousarray(self._renderer.render())
 
 
-def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
+def draw_estimate(trials: Trials, attempt: Attempt) -> RGBImage:
     """Return the scene's camera image with a wireframe of the grasped part's estimated cuboid."""
+    scene = attempt.scene
     if attempt.estimate is None:
         return scene.image
     flange = trials.arm.flange(scene.joints)
@@ -88,20 +89,20 @@ def draw_estimate(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBIma
     return overlay(scene.image, [Wireframe(keypoints)])
 
 
-def strip(trials: Trials, scene: TrialScene, attempt: Attempt) -> RGBImage:
+def strip(trials: Trials, attempt: Attempt) -> RGBImage:
     """Return the camera image and, with OpenGL, five side views of the motion, side by side."""
     states = attempt.outcome.states
-    tiles = [Tile(draw_estimate(trials, scene, attempt))]
+    tiles = [Tile(draw_estimate(trials, attempt))]
     if states and has_gl():
-        view = SideView(scene)
+        view = SideView(attempt.scene)
         chosen = [states[round(share * (len(states) - 1))] for share in STRIP[1:]]
         tiles += [Tile(view.draw(state)) for state in chosen]
     return contact_sheet(tiles, columns=3, tile_width=320)
 
 
-def write_video(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
+def write_video(path: Path, trials: Trials, attempt: Attempt) -> None:
     """Write a video of a trial's motion from the side, with the camera image in a corner."""
-    view, image = SideView(scene), draw_estimate(trials, scene, attempt)
+    view, image = SideView(attempt.scene), draw_estimate(trials, attempt)
     inset = cv2.resize(image, (213, 160), interpolation=cv2.INTER_AREA)
     outcome = attempt.outcome
     states = list(zip(outcome.times, outcome.states, strict=True))[::STRIDE]
@@ -112,7 +113,7 @@ def write_video(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
             video.write(frame, time)
 
 
-def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt) -> None:
+def write_rerun(path: Path, trials: Trials, attempt: Attempt) -> None:
     """Write a trial as a Rerun recording of the moving shapes of robot and solids."""
     require("rerun", "--rerun", "rerun")
     import rerun as rr
@@ -121,9 +122,9 @@ def write_rerun(path: Path, trials: Trials, scene: TrialScene, attempt: Attempt)
     with draft(path) as partial:
         recording.save(partial)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        image = draw_estimate(trials, scene, attempt)
+        image = draw_estimate(trials, attempt)
         recording.log("image", rr.Image(image), static=True)
-        model = Cell([item.solid for item in scene.placed], "all", T_flange_cam=MOUNT).model
+        model = Cell([item.solid for item in attempt.scene.placed], "all", T_flange_cam=MOUNT).model
         state = mujoco.MjData(model)
         bodies = _log_shapes(recording, model)
         for time, positions in zip(attempt.outcome.times, attempt.outcome.states, strict=True):

@@ -138,11 +138,11 @@ def make_experiment(
     if video is not None or task.renderer == "mujoco":
         open_gl(Cell(shown="solids").model, SIZE).close()  # fail now, not after all trials
     start, records = time.monotonic(), []
-    for record in run_trials(task, count, workers or available_cores()):
-        records.append(record)
-        if len(records) % (len(task.sources) * BLOCK) == 0:
+    for done, trial in enumerate(run_trials(task, count, workers or available_cores()), 1):
+        records += trial
+        if done % BLOCK == 0:
             first = [record for record in records if record.source == task.sources[0].name]
-            report_progress(f"{len(first)} of {count}: {count_records(first).caught} caught")
+            report_progress(f"{done} of {count}: {count_records(first).caught} caught")
     facts = _facts(task, records, time.monotonic() - start)
     write_report(folder, records, facts)
     if all(record.failure == "no plan" for record in records):
@@ -174,8 +174,8 @@ def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[s
     }
 
 
-def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
-    """Run trials in ``workers`` processes; yield one record per source when a trial is done.
+def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[list[Record]]:
+    """Run trials in ``workers`` processes; yield the records of a trial when the trial is done.
 
     Raises:
         RunError: A process died.
@@ -184,21 +184,21 @@ def run_trials(task: GraspTask, count: int, workers: int) -> Iterator[Record]:
     run = partial(_run_trial, task)
     if workers == 1:
         for number in range(count):
-            yield from run(number)
+            yield run(number)
         return
     with ProcessPool(pickle.dumps(run), min(workers, count)) as pool:
         for _, future in pool.run(range(count)):
             try:
-                yield from future.result()
+                yield future.result()
             except LostWorkerError as error:
                 raise RunError(str(error)) from error
 
 
 def _run_trial(task: GraspTask, number: int) -> list[Record]:
-    """Return the records of trial ``number`` with each pose source of the task."""
+    """Return the records of trial ``number``: all attempts with each pose source of the task."""
     trials = _task_trials(task)
     scene = trials.scene(number)
-    return [trials.attempt(scene, source).record for source in task.sources]
+    return [attempt.record for source in task.sources for attempt in trials.attempts(scene, source)]
 
 
 @lru_cache(maxsize=1)
@@ -211,7 +211,7 @@ def _task_trials(task: GraspTask) -> Trials:
 class Counts:
     """Numbers of trials, of recognised parts (ADD below a tenth of the diameter) and of catches."""
 
-    trials: int
+    trials: int  # with heaps, the number of attempts
     recognised: int
     caught: int
 
@@ -228,15 +228,15 @@ class Counts:
 
 
 def count_records(records: Sequence[Record]) -> Counts:
-    """Count the trials with a recognised part and with a caught part."""
+    """Count the records with a recognised part and with a caught part."""
     recognised = sum(record.recognised for record in records)
     return Counts(len(records), recognised, sum(record.caught for record in records))
 
 
 def by_source(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Group records by pose source, and sort each group by trial number."""
+    """Group records by pose source, and sort each group by trial and attempt."""
     groups: dict[str, list[Record]] = {}
-    for record in sorted(records, key=lambda record: record.number):
+    for record in sorted(records, key=lambda record: (record.number, record.attempt)):
         groups.setdefault(record.source, []).append(record)
     return groups
 
@@ -265,7 +265,7 @@ def table_9(records: Sequence[Record]) -> list[str]:
 def sources_table(records: Sequence[Record]) -> list[str]:
     """Return Markdown lines of a table of success rates and failures, a row per pose source."""
     lines = [
-        "| poses | trials | recognised (ADD-0.1d) | caught | median error at the arm "
+        "| poses | attempts | recognised (ADD-0.1d) | caught | median error at the arm "
         f"| {' | '.join(FAILURES)} |",
         f"| --- | ---: | ---: | ---: | ---: {'| ---: ' * len(FAILURES)}|",
     ]
@@ -282,14 +282,59 @@ def sources_table(records: Sequence[Record]) -> list[str]:
     return lines
 
 
+@dataclass(frozen=True)
+class HeapCounts:
+    """Numbers of heaps, parts and attempts with one pose source."""
+
+    heaps: int
+    emptied: int  # heaps of which every part was lifted
+    parts: int  # parts in all heaps
+    lifted: int  # lifted parts, including those that the gripper held with another part
+    attempts: int
+
+
+def count_heaps(records: Sequence[Record]) -> HeapCounts:
+    """Count heaps and their parts from the records of all attempts with one pose source."""
+    left: dict[int, int] = {}
+    for record in by_source(records)[records[0].source]:
+        left[record.number] = record.parts - record.lifted
+    parts = sum(record.parts for record in records if record.attempt == 1)
+    emptied = sum(count == 0 for count in left.values())
+    return HeapCounts(len(left), emptied, parts, parts - sum(left.values()), len(records))
+
+
+def heaps_table(records: Sequence[Record]) -> list[str]:
+    """Return Markdown lines of a table of emptied heaps, a row per pose source."""
+    lines = [
+        "| poses | heaps | emptied | parts lifted | caught at the first attempt |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for name, rows in by_source(records).items():
+        heaps = count_heaps(rows)
+        first = count_records([row for row in rows if row.attempt == 1])
+        emptied = Counts(heaps.heaps, heaps.emptied, 0).rate(heaps.emptied)
+        lines.append(
+            f"| {name} | {heaps.heaps} | {emptied} | {heaps.lifted} of {heaps.parts} "
+            f"| {first.rate(first.caught)} |"
+        )
+    return lines
+
+
+def _has_heaps(records: Sequence[Record]) -> bool:
+    return any(record.parts > 1 for record in records)
+
+
 def markdown(records: Sequence[Record], facts: Mapping[str, Any]) -> str:
     """Return the report in Markdown; ``facts`` are listed at its top."""
     first = next(iter(by_source(records).values()))
     listed = [f"- {name}: {value}" for name, value in facts.items() if value is not None]
-    tables = {
-        f"Table 9: {first[0].source}": table_9(first),
-        "Poses and failures": sources_table(records),
-    }
+    if _has_heaps(records):
+        tables = {"Heaps": heaps_table(records), "Attempts": sources_table(records)}
+    else:
+        tables = {
+            f"Table 9: {first[0].source}": table_9(first),
+            "Poses and failures": sources_table(records),
+        }
     lines = ["# Grasps in simulation", "", *listed, ""]
     for title, table in tables.items():
         lines += [f"## {title}", "", *table, ""]
@@ -335,6 +380,7 @@ def _summary(rows: Sequence[Record]) -> dict[str, Any]:
     total = count_records(rows)
     return {
         **asdict(total),
+        **({"heaps": asdict(count_heaps(rows))} if _has_heaps(rows) else {}),
         "recognised_interval": total.interval(total.recognised),
         "caught_interval": total.interval(total.caught),
         "failures": {name: sum(row.failure == name for row in rows) for name in FAILURES},

@@ -5,9 +5,9 @@ A task and the records of its trials can be pickled for worker processes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy, deepcopy
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -22,10 +22,17 @@ from dopepp.geometry.camera import Transform, invert_transform, make_transform, 
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.parts.catalogue import load_part
-from dopepp.robot.grasping.cell import HOME, TRAY, Cell
+from dopepp.robot.grasping.cell import HOME, JOINTS, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
-from dopepp.robot.grasping.grasps import find_grasps
-from dopepp.robot.grasping.planner import Arm, Joints, Planner, align_with_bench, measure_gripper
+from dopepp.robot.grasping.grasps import TILTS, find_grasps
+from dopepp.robot.grasping.planner import (
+    LOW,
+    Arm,
+    Joints,
+    Planner,
+    align_with_bench,
+    measure_gripper,
+)
 from dopepp.robot.grasping.rehearsal import (
     MOUNT,
     CalibratedRobot,
@@ -34,6 +41,7 @@ from dopepp.robot.grasping.rehearsal import (
     downward_view,
     draw_robot,
 )
+from dopepp.robot.grasping.selection import EstimatedPart, choose_part
 from dopepp.robot.grasping.viewpoint import choose_viewpoint
 from dopepp.robot.grasping.workbench import (
     Layout,
@@ -62,8 +70,9 @@ DISTANCE_MARGIN: Final = 1.2  # factor on camera distances, for parts off the tr
 FLAT_TILT_DEG: Final = 60.0
 """Largest tilt of templates for flat parts: the camera's tilt plus the effect of perspective."""
 
-SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
+SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 0.4}
 MAX_OBSTACLES: Final = 8  # number of parts in the planner's model
+EXTRA_ATTEMPTS: Final = 3  # number of attempts at a heap beyond its number of parts
 RECOGNISED: Final = 0.1  # largest ADD of a recognised part, as a share of its diameter
 
 
@@ -105,7 +114,7 @@ class GraspTask:
 
 @dataclass(frozen=True)
 class Record:
-    """Result of a grasp trial with one pose source."""
+    """Result of an attempt to grasp a part in a trial with one pose source."""
 
     number: int  # index of the trial, from 0; equal indices have equal scenes
     source: str  # name of the pose source
@@ -122,22 +131,26 @@ class Record:
     hand_eye_mm: float  # position error by the hand-eye calibration at the parts' distance
     hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
     second_view: str = ""  # where the camera took a second image, and the reason
+    attempt: int = 1  # number of the attempt in this trial, from 1
+    parts: int = 1  # number of parts on the bench before the attempt
+    lifted: int = 0  # number of parts that the gripper held after lifting and shaking
 
 
 @dataclass(frozen=True, eq=False)
 class SceneObservation:
-    """Poses of the parts that the controller obtained, and the arm's joints at the last image."""
+    """Parts that the controller detected, and the arm's joints at the last image."""
 
-    poses: list[Transform]  # T_base_obj of the parts, sorted by descending height
+    parts: list[EstimatedPart]  # sorted by descending height
     joints: Joints  # joints of the arm at the last image, radians
     second_view: str = ""  # as in :class:`Record`
 
 
 @dataclass(frozen=True, eq=False)
 class TrialScene:
-    """The objects, the robot and the camera image of a trial before the grasp."""
+    """The objects, the robot and the camera image of a trial before an attempt."""
 
     number: int  # index of the trial
+    attempt: int  # number of the attempt, from 1
     cell: Cell
     placed: Sequence[PlacedSolid]  # objects before they settle, the parts first
     start: Any  # state of the MuJoCo simulation before the grasp
@@ -148,21 +161,31 @@ class TrialScene:
     T_base_cam: Transform  # the true pose of the camera
     image: RGBImage
     photograph: Photographer  # renders images of the scene from other camera poses
+    # Returns the photograph function for other poses of the objects, with the same light.
+    arrange: Callable[[Sequence[Transform]], Photographer]
+    taken: frozenset[int] = frozenset()  # indices of the objects that earlier attempts lifted
+
+    @property
+    def parts(self) -> list[int]:
+        """Indices of the parts on the bench."""
+        parts = (index for index, item in enumerate(self.placed) if item.body.part)
+        return [index for index in parts if index not in self.taken]
 
     @property
     def targets(self) -> list[Transform]:
         """True poses T_base_obj of the parts at rest, sorted by descending height."""
-        placed = zip(self.placed, self.poses, strict=True)
-        return sorted((pose for item, pose in placed if item.body.part), key=_height, reverse=True)
+        return sorted((self.poses[index] for index in self.parts), key=_height, reverse=True)
 
 
 @dataclass(eq=False)
 class Attempt:
-    """The record, the motion and the used pose of a trial with one pose source."""
+    """The record, the motion and the used pose of an attempt with one pose source."""
 
+    scene: TrialScene
     record: Record
     outcome: Outcome = field(default_factory=Outcome)
     estimate: Transform | None = None  # estimated T_base_obj of the grasped part
+    state: Any = None  # state of the MuJoCo simulation after the motion, None without a motion
 
 
 class Trials:
@@ -234,56 +257,126 @@ class Trials:
         for index, item in enumerate(placed):
             cell.put(state, index, item.T_base_obj)
         joints, T_base_cam = self._aim_camera(robot, rng)
-        execution = Execution(cell, state, self.gripper, robot.zero)
-        execution.stand(joints)
-        execution.wait(SETTLE_S[self.task.layout])
-        poses = [cell.pose(state, index) for index in range(count)]
+        poses = self._settle(cell, state, robot, joints)
         view: RasterView | MujocoView = self._raster
         if self.task.renderer == "mujoco":
             view = self._parts_view(count) if is_parts_only else MujocoView(solids)
-        photograph = view.arrange([item.body for item in placed], poses, T_base_cam, rng)
-        camera = joints, T_base_cam, photograph(T_base_cam, rng), photograph
-        return TrialScene(number, cell, placed, state, poses, robot, calibrated, *camera)
+        bodies, appearance = [item.body for item in placed], deepcopy(rng)
 
-    def attempt(self, scene: TrialScene, source: PoseSource) -> Attempt:
-        """Grasp the highest part for which a motion is found, at the poses from a source."""
+        def arrange(poses: Sequence[Transform]) -> Photographer:
+            return view.arrange(bodies, poses, T_base_cam, deepcopy(appearance))
+
+        photograph = view.arrange(bodies, poses, T_base_cam, rng)
+        camera = joints, T_base_cam, photograph(T_base_cam, rng), photograph, arrange
+        return TrialScene(number, 1, cell, placed, state, poses, robot, calibrated, *camera)
+
+    def _settle(self, cell: Cell, state: Any, robot: TrueRobot, joints: Joints) -> list[Transform]:
+        """Simulate until the solids rest, with the arm at ``joints``; return their poses."""
+        execution = Execution(cell, state, self.gripper, robot.zero)
+        execution.stand(joints)
+        execution.wait(SETTLE_S[self.task.layout])
+        return [cell.pose(state, index) for index in range(cell.count)]
+
+    def attempts(self, scene: TrialScene, source: PoseSource) -> Iterator[Attempt]:
+        """Yield the attempts of a trial: one, or for a heap as many as it takes to empty the heap.
+
+        A heap gets at most :data:`EXTRA_ATTEMPTS` more attempts than it has parts, and is given up
+        when two successive attempts find no plan. Before each attempt the camera takes a new image.
+        """
+        limit = len(scene.parts) + EXTRA_ATTEMPTS if self.task.layout == "heap" else 1
+        failed: list[Transform] = []
+        failure = ""
+        while True:
+            attempt = self.attempt(scene, source, failed)
+            yield attempt
+            is_empty = len(attempt.outcome.lifted) == len(scene.parts)
+            is_stuck = failure == attempt.record.failure == "no plan"
+            if is_empty or is_stuck or scene.attempt == limit:
+                return
+            failure = attempt.record.failure
+            if failure and attempt.estimate is not None:
+                failed.append(attempt.estimate)
+            scene = self._look_again(attempt)
+
+    def _look_again(self, attempt: Attempt) -> TrialScene:
+        """Return the scene after an attempt, without the lifted objects, from a new camera pose."""
+        scene, lifted = attempt.scene, attempt.outcome.lifted
+        rng = np.random.default_rng([self.task.seed, scene.number, 1 + 2 * scene.attempt])
+        state = copy(scene.start) if attempt.state is None else attempt.state
+        for index in lifted:
+            scene.cell.put_away(state, index)
+        state.qpos[scene.cell.fingers] = self.gripper.fingers(self.gripper.widest)
+        state.ctrl[JOINTS] = 0.0
+        joints, T_base_cam = self._aim_camera(scene.robot, rng)
+        poses = self._settle(scene.cell, state, scene.robot, joints)
+        photograph = scene.arrange(poses)
+        return replace(
+            scene,
+            attempt=scene.attempt + 1,
+            start=state,
+            poses=poses,
+            joints=joints,
+            T_base_cam=T_base_cam,
+            image=photograph(T_base_cam, rng),
+            photograph=photograph,
+            taken=scene.taken.union(lifted),
+        )
+
+    def attempt(
+        self, scene: TrialScene, source: PoseSource, failed: Sequence[Transform] = ()
+    ) -> Attempt:
+        """Grasp the best part for which a motion is found, at the poses from a source.
+
+        ``failed`` are poses T_base_obj at which earlier attempts failed.
+        """
         observation = self._observe(scene, source)
-        if not observation.poses:
-            return Attempt(self._record(scene, source, observation, None, None))
+        if not observation.parts:
+            return Attempt(scene, self._record(scene, source, observation, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        flat = [align_with_bench(pose, hull, bench) for pose in observation.poses][:MAX_OBSTACLES]
-        planner, estimate, outcome = self._planner(scene), observation.poses[0], None
-        for number, target in enumerate(flat):
-            others = [*flat[:number], *flat[number + 1 :]]
-            plan = planner.plan([target, *others], self.grasps, observation.joints)
-            if plan is not None:
-                estimate, state = observation.poses[number], copy(scene.start)
-                execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
-                if observation.second_view:
-                    execution.move(np.stack([scene.joints, observation.joints]))
-                outcome = execution.run(plan)
-                break
+        parts = observation.parts[:MAX_OBSTACLES]
+        low = LOW[self.task.layout]
+        poses = (align_with_bench(part.T_base_obj, hull, bench, low) for part in parts)
+        flat = [replace(part, T_base_obj=pose) for part, pose in zip(parts, poses, strict=True)]
+        planner, joints = self._planner(scene), observation.joints
+        choice = choose_part(planner, flat, self.part.points, self.grasps, joints, failed)
+        if choice is None:
+            estimate = parts[0].T_base_obj
+            record = self._record(scene, source, observation, estimate, None)
+            return Attempt(scene, record, estimate=estimate)
+        estimate, state = parts[choice.number].T_base_obj, copy(scene.start)
+        execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
+        if observation.second_view:
+            execution.move(np.stack([scene.joints, joints]))
+        outcome = execution.run(choice.plan)
         record = self._record(scene, source, observation, estimate, outcome)
-        return Attempt(record, outcome or Outcome(), estimate)
+        return Attempt(scene, record, outcome, estimate, state)
 
     def _planner(self, scene: TrialScene) -> Planner:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
-        return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
+        tilts = TILTS.tolist() if self.task.layout == "heap" else [0.0]
+        knowledge = scene.calibrated.knowledge
+        return Planner(self.arm, self.gripper, self._parts_cell(count), knowledge, tilts)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
-        """Return the poses of the parts from a source, which takes one or two images if needed."""
-        rng = np.random.default_rng([self.task.seed, scene.number, 2])
+        """Return the parts detected by a source, which takes one or two images if needed."""
+        rng = np.random.default_rng([self.task.seed, scene.number, 2 * scene.attempt])
         if source.kind == "random":
-            return SceneObservation([self.layout.draw_pose(rng)], scene.joints)
+            return SceneObservation([EstimatedPart(self.layout.draw_pose(rng))], scene.joints)
         if source.kind == "exact":
-            poses = [_perturb(pose, source.error, rng) for pose in scene.targets]
-            return SceneObservation(poses, scene.joints)
+            poses = (_perturb(pose, source.error, rng) for pose in scene.targets)
+            return SceneObservation([EstimatedPart(pose) for pose in poses], scene.joints)
         estimator = self.templates if source.kind == "templates" else self.estimator
         lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
         if self.task.views == 1:
             detections = estimator.predict(scene.image, lens.K, lens.coefficients)
-            poses = [T_base_cam @ item.T_cam_obj for item in self._likely(detections)]
-            return SceneObservation(sorted(poses, key=_height, reverse=True), scene.joints)
+            parts = [
+                EstimatedPart(
+                    T_base_cam @ item.T_cam_obj,
+                    item.score if item.probability is None else item.probability,
+                )
+                for item in self._likely(detections)
+            ]
+            return SceneObservation(_by_height(parts), scene.joints)
         result = estimator.predict_views([scene.image], [lens], [T_base_cam])
         likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
         likely.sort(key=lambda part: _height(part.T_world_obj), reverse=True)
@@ -296,8 +389,9 @@ class Trials:
             image = scene.photograph(self._true_camera_pose(scene.robot, joints), rng)
             cameras = [T_base_cam, self._camera_pose(scene, source, joints)]
             result = estimator.predict_views([scene.image, image], [lens] * 2, cameras)
-        poses = [part.T_world_obj for part in self._likely(result.detections)]
-        return SceneObservation(sorted(poses, key=_height, reverse=True), joints, reason)
+        likely = self._likely(result.detections)
+        parts = [EstimatedPart(part.T_world_obj, part.probability) for part in likely]
+        return SceneObservation(_by_height(parts), joints, reason)
 
     def _likely(self, detections: Sequence[AnyDetection]) -> list[AnyDetection]:
         """Return the part's detections with at least half the score of its best detection."""
@@ -322,20 +416,22 @@ class Trials:
         estimate: Transform | None,
         outcome: Outcome | None,
     ) -> Record:
-        """Return the result of a trial; ``outcome`` is None if no plan was found."""
+        """Return the result of an attempt; ``outcome`` is None if no plan was found."""
         robot = scene.calibrated
         ends = (robot.hand_eye_mm, robot.hand_eye_deg, observation.second_view)
+        counts: dict[str, Any] = {"attempt": scene.attempt, "parts": len(scene.parts)}
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
             nan = float("nan")
-            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends)
+            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends, **counts)
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
         angle = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
         is_recognised = bool(add < RECOGNISED * self.part.diameter)
-        parts = [index for index, item in enumerate(scene.placed) if item.body.part]
-        is_caught = outcome is not None and outcome.held in parts
+        is_caught = outcome is not None and outcome.held in scene.parts
+        if outcome is not None:
+            counts["lifted"] = len(set(scene.parts).intersection(outcome.lifted))
         if is_caught:
             failure = ""
         elif not is_recognised:
@@ -345,7 +441,7 @@ class Trials:
         else:
             failure = "collided" if outcome.collided else "slipped"
         pose = (1000 * add, 1000 * shift, angle)
-        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends)
+        return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends, **counts)
 
     def _add(self, estimate: Transform, target: Transform) -> float:
         """Return the smallest ADD over the part's symmetries, metres."""
@@ -375,6 +471,10 @@ class Trials:
 
 def _height(T_base_obj: Transform) -> float:
     return float(T_base_obj[2, 3])
+
+
+def _by_height(parts: Sequence[EstimatedPart]) -> list[EstimatedPart]:
+    return sorted(parts, key=lambda part: _height(part.T_base_obj), reverse=True)
 
 
 def _perturb(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:

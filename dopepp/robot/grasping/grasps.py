@@ -43,7 +43,7 @@ CLEARANCE: Final = 0.006  # preferred distance of each descending finger from th
 PAD_HALF: Final = np.array([0.004, 0.011, 0.009375])
 """Half the thickness, width and length of a finger pad, metres. A finger has two pads in a row."""
 
-INSERTIONS: Final = (0.009, 0.003)
+INSERTIONS: Final = (0.009, 0.003, 0.0015)
 """Distances of the pads' ends beyond a grasp's point, metres: half a pad, or less above an
 obstacle."""
 

@@ -8,9 +8,9 @@ Inverse kinematics (by mink) takes differential steps within the joints' limits.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+from typing import Final
 
 import mink
 import mujoco
@@ -32,13 +32,20 @@ POSITION_TOLERANCE: Final = 1e-4  # metres
 ANGLE_TOLERANCE: Final = 1e-3  # radians
 STEPS: Final = 60  # iterations of inverse kinematics; a reachable pose needs about ten
 COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # gripper commands, open to closed
-LOW: Final = 0.005  # largest estimated height above the bench of a part that lies on it, metres
+LOW: Final = {"single": 0.005, "distractors": 0.005, "heap": 0.002}
+"""Largest estimated height above the bench of a part that lies on it, by layout, metres. In a heap,
+a part that leans on another part is not much higher."""
 
 STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
 RETREAT: Final = 0.06  # length of the straight descent, metres
 LIFT: Final = 0.12  # height of the lift, metres
 CHECKS: Final = 24  # collision checks per radian of a path
-PENETRATION: Final = 1e-4  # minimum penetration of a collision, metres
+PENETRATION: Final = 1e-4  # minimum penetration of a collision of the robot, metres
+CARRIED: Final = 1e-3  # minimum penetration of a collision of the carried part, metres
+LIFT_CHECKS: Final = 25  # collision checks of a lift: every 5 mm
+DISTURBING: Final = 0.3  # factor on the quality of a grasp whose lift moves other objects
+SHALLOW: Final = 0.2  # smallest factor on the quality of a grasp less than 3 mm deep
+SHIFT: Final = 0.002  # displacements of the hand for the margin of a grasp, metres
 
 
 class Arm:
@@ -143,14 +150,17 @@ class Plan:
     lift: Path  # along the bench's normal
     opening: float  # distance between the fingers before they close, metres
     grasp: Grasp  # grasp that the motion executes
+    quality: float  # in (0, 1]; 1 for a level, free part and much room for the fingers
 
 
-def align_with_bench(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
+def align_with_bench(
+    T_base_obj: Transform, hull: Hull, T_base_bench: Transform, low: float
+) -> Transform:
     """Rotate and move an estimated pose so that the part's lowest stable face lies on the bench.
 
     An image from above determines tilt and height poorly; the bench determines both well. If the
-    lowest point is more than 5 mm above or below the bench after the rotation, the part leans on
-    another object, and its pose is returned unchanged.
+    lowest point is more than ``low`` (metres) above or below the bench after the rotation, the part
+    leans on another object, and its pose is returned unchanged.
     """
     up = T_base_bench[:3, 2]
     normals = hull.rests[0] @ T_base_obj[:3, :3].T
@@ -162,7 +172,7 @@ def align_with_bench(T_base_obj: Transform, hull: Hull, T_base_bench: Transform)
     position = centre + R @ (T_base_obj[:3, 3] - centre)
     flat = make_transform(R @ T_base_obj[:3, :3], position)
     lowest = float(((transform(flat, hull.vertices) - T_base_bench[:3, 3]) @ up).min())
-    if abs(lowest) > LOW:
+    if abs(lowest) > low:
         return T_base_obj
     flat[:3, 3] -= lowest * up
     return flat
@@ -176,12 +186,20 @@ class Planner:
         gripper: Kinematics of the gripper.
         cell: Model for collision checks, with at least as many parts as the plans consider.
         knowledge: Calibrated poses of the camera, the tool tip and the bench.
+        tilts: Rotations of the hand about the closing direction, radians. Later rotations are tried
+            if no grasp is feasible with the earlier ones.
     """
 
     def __init__(
-        self, arm: Arm, gripper: Gripper, cell: Cell, knowledge: ControllerParameters
+        self,
+        arm: Arm,
+        gripper: Gripper,
+        cell: Cell,
+        knowledge: ControllerParameters,
+        tilts: Sequence[float] = (0.0,),
     ) -> None:
         self.arm, self._gripper, self._cell, self.knowledge = arm, gripper, cell, knowledge
+        self._tilts = tilts
         self._state = cell.data()
         model = cell.model
         self._hand = np.array(["gripper/" in model.body(body).name for body in model.geom_bodyid])
@@ -197,14 +215,16 @@ class Planner:
             start: Current joint angles of the arm.
 
         Returns:
-            The motion of the first grasp that is reachable without a collision, or None.
+            The motion of the first grasp that is reachable, and with which the hand approaches,
+            closes and lifts without a collision, or None.
         """
         self._place(poses)
-        for grasp in grasps:
-            for tool in self._tools(poses[0], grasp):
-                motion = self._motion(tool, grasp, start)
+        for tilt, insertion, grasp in product(self._tilts, INSERTIONS, grasps):
+            for tool, depth in self._tools(poses[0], grasp, tilt, insertion):
+                motion = self._motion(poses[0], tool, grasp, start)
                 if motion is not None:
-                    return motion
+                    grip = max(SHALLOW, min(depth / INSERTIONS[1], 1.0))
+                    return replace(motion, quality=motion.quality * grip)
         return None
 
     def can_move(self, poses: Sequence[Transform], start: Joints, end: Joints) -> bool:
@@ -215,34 +235,47 @@ class Planner:
     def _place(self, poses: Sequence[Transform]) -> None:
         """Place the model's parts at poses T_base_obj, and surplus parts away from the bench."""
         for number in range(self._cell.count):
-            pose = make_transform(np.eye(3), np.array([2.0, number, 0.5]))
-            self._cell.put(self._state, number, poses[number] if number < len(poses) else pose)
+            if number < len(poses):
+                self._cell.put(self._state, number, poses[number])
+            else:
+                self._cell.put_away(self._state, number)
 
-    def _tools(self, T_base_obj: Transform, grasp: Grasp) -> Iterator[Transform]:
-        """Yield T_base_tool, the pads' ends, for a grasp and its half turn, the deepest pose first.
+    def _tools(
+        self, T_base_obj: Transform, grasp: Grasp, tilt: float, insertion: float
+    ) -> Iterator[tuple[Transform, float]]:
+        """Yield T_base_tool of the pads' ends and their depth for a grasp and its half turn.
 
-        A pose is omitted if it is tilted by more than :data:`STEEPEST` or touches the bench.
+        The depth beyond the grasp's point is ``insertion``, or for the largest insertion as much as
+        the bench allows, metres. A pose is omitted if it is tilted by more than :data:`STEEPEST` or
+        touches the bench.
         """
         up = self.knowledge.T_base_bench[:3, 2]
         half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
         signs = [[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
         ends = np.array(signs) * [half_width, half_pad, 0.0]
         for flipped in (False, True):
-            T = T_base_obj @ grasp.T_obj_tool(flipped)
+            T = T_base_obj @ grasp.T_obj_tool(flipped) @ _rotation_x(tilt)
             steep = -float(T[:3, 2] @ up)
             if steep < np.cos(STEEPEST):
                 continue
             points = ends @ T[:3, :3].T + T[:3, 3] - self.knowledge.T_base_bench[:3, 3]
             room = (float((points @ up).min()) - ABOVE_BENCH) / steep
-            if room >= 0:
-                for depth in sorted({min(room, depth) for depth in INSERTIONS}, reverse=True):
-                    yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
+            if room >= 0 and (insertion < room or insertion == INSERTIONS[0]):
+                depth = min(room, insertion)
+                yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2]), depth
 
-    def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
+    def _motion(
+        self, T_base_obj: Transform, T_base_tool: Transform, grasp: Grasp, start: Joints
+    ) -> Plan | None:
         """Return a plan that moves the pads' ends to a pose, or None if blocked or out of reach."""
+        up = self.knowledge.T_base_bench[:3, 2]
         tip = self.knowledge.tip.copy()
         tip[2] += self._gripper.reach(grasp.width) - self._gripper.reach(0.0)
         T_base_flange = T_base_tool @ make_transform(np.eye(3), -tip)
+        # Most candidates are blocked at the part, so this pose is checked before a path is planned.
+        at_part = self.arm.joints(T_base_flange, start)
+        if at_part is None or not self._can_close(at_part, grasp):
+            return None
         before = T_base_flange.copy()
         before[:3, 3] -= RETREAT * T_base_flange[:3, 2]
         first = self.arm.joints(before, start)
@@ -255,9 +288,49 @@ class Planner:
         if not self._is_free(approach, grasp.opening):
             return None
         above = T_base_flange.copy()
-        above[:3, 3] += LIFT * self.knowledge.T_base_bench[:3, 2]
+        above[:3, 3] += LIFT * up
         lift = self._line(descent[-1], T_base_flange, above)
-        return None if lift is None else Plan(approach, descent, lift, grasp.opening, grasp)
+        if lift is None:
+            return None
+        freedom = self._lift_freedom(lift, grasp.width, T_base_obj)
+        if freedom == 0:
+            return None
+        steep, level = -float(T_base_tool[:3, 2] @ up), 1 - float(T_base_tool[:3, 0] @ up) ** 2
+        quality = steep * level * freedom * self._margin(T_base_flange, at_part, grasp)
+        return Plan(approach, descent, lift, grasp.opening, grasp, quality)
+
+    def _can_close(self, joints: Joints, grasp: Grasp) -> bool:
+        """Return whether the hand is free at a grasp, open and when the fingers touch the part."""
+        if self._collides(joints, grasp.opening):
+            return False
+        return not self._collides(joints, grasp.width, carries=True)
+
+    def _lift_freedom(self, path: Path, width: float, T_base_obj: Transform) -> float:
+        """Return how freely the model's first part, now at ``T_base_obj``, can be lifted.
+
+        Returns:
+            0 if the hand hits an object, :data:`DISTURBING` if the part does, else 1.
+        """
+        T_flange_obj = np.linalg.inv(self.arm.flange(path[0])) @ T_base_obj
+        shares = np.linspace(0, len(path) - 1, LIFT_CHECKS)[1:]
+        freedom = 1.0
+        for joints in np.stack([np.interp(shares, range(len(path)), q) for q in path.T], axis=1):
+            self._cell.put(self._state, 0, self.arm.flange(joints) @ T_flange_obj)
+            if self._collides(joints, width, carries=True):
+                freedom = 0.0
+            elif self._is_part_hit():
+                freedom = min(freedom, DISTURBING)
+        self._cell.put(self._state, 0, T_base_obj)
+        return freedom
+
+    def _margin(self, T_base_flange: Transform, joints: Joints, grasp: Grasp) -> float:
+        """Return a share from 0.2 to 1: how often a hand displaced by :data:`SHIFT` is free."""
+        num_free = 1
+        for shift in ([SHIFT, 0, 0], [-SHIFT, 0, 0], [0, SHIFT, 0], [0, -SHIFT, 0]):
+            displaced = T_base_flange @ make_transform(np.eye(3), np.array(shift))
+            beside = self.arm.joints(displaced, joints)
+            num_free += beside is not None and not self._collides(beside, grasp.opening)
+        return num_free / 5
 
     def _line(self, start: Joints, T_from: Transform, T_to: Transform) -> Path | None:
         """Return joints that move the flange straight, or None if a pose is out of reach."""
@@ -280,19 +353,32 @@ class Planner:
                     return False
         return True
 
-    def _collides(self, joints: Joints, opening: float) -> bool:
-        """Return whether the robot collides at joint angles with the pads ``opening`` apart."""
+    def _collides(self, joints: Joints, opening: float, carries: bool = False) -> bool:
+        """Return whether the robot collides at joint angles with the pads ``opening`` apart.
+
+        If the hand ``carries`` the first part, it may touch this part.
+        """
         state, cell = self._state, self._cell
         state.qpos[:JOINTS] = joints
         state.qpos[cell.fingers] = self._gripper.fingers(opening)
         mujoco.mj_kinematics(cell.model, state)
         mujoco.mj_comPos(cell.model, state)
         mujoco.mj_collision(cell.model, state)
-        return any(self._is_hit(contact) for contact in state.contact)
+        groups = cell.groups[state.contact.geom]
+        hits = (groups == 0).any(axis=1) & ~self._hand[state.contact.geom].all(axis=1)
+        if carries:
+            hits &= ~(groups == 1).any(axis=1)
+        return bool((hits & (state.contact.dist < -PENETRATION)).any())
 
-    def _is_hit(self, contact: Any) -> bool:
-        """Return whether a MuJoCo contact of the robot, except within the hand, penetrates."""
-        first, second = contact.geom
-        if contact.dist > -PENETRATION or (self._hand[first] and self._hand[second]):
-            return False
-        return bool(0 in self._cell.groups[[first, second]])
+    def _is_part_hit(self) -> bool:
+        """Return whether the first part penetrates bench or another part at the last check."""
+        contact = self._state.contact
+        groups = self._cell.groups[contact.geom]
+        is_part = groups == 1
+        hits = is_part.any(axis=1) & ~(is_part | (groups == 0)).all(axis=1)
+        return bool((hits & (contact.dist < -CARRIED)).any())
+
+
+def _rotation_x(angle: float) -> Transform:
+    """Return a rotation about x by ``angle``, radians, as a transform."""
+    return make_transform(rotation_vector_to_matrix(np.array([angle, 0.0, 0.0])), np.zeros(3))

@@ -18,13 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import Transform, invert_transform, make_transform
+from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
 from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body, distractor_shapes, make_body
+from dopepp.virtual.physics import settle
 from dopepp.virtual.presets import PRESETS
 from dopepp.virtual.presets.table import Table, plane_of
 from dopepp.virtual.renderers import find_renderer
@@ -36,6 +37,7 @@ SPREAD: Final = 0.025  # radius of the circle in which a part's centre is sample
 DROP_HEIGHT: Final = 0.0005  # initial height of objects above the bench, metres
 HEAP: Final = (3, 5)  # minimum and maximum number of parts in a heap
 HEAP_SPREAD: Final = 0.05  # radius within which parts of a heap fall, metres
+HEAP_TRIALS: Final = 8  # number of heaps that are dropped until one comes to rest
 HEAP_TILT: Final = 15.0  # largest initial tilt of a falling part, degrees
 DISTRACTORS: Final = (2, 4)  # smallest and largest number of distractors
 DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of a distractor's radius, metres
@@ -140,10 +142,27 @@ class Layout:
         return solids
 
     def heap(self, rng: Generator) -> list[PlacedSolid]:
-        """Sample 3 to 5 parts at increasing heights, which fall onto each other."""
+        """Sample 3 to 5 parts above each other, and let them fall onto each other.
+
+        Raises:
+            UserError: The parts do not come to rest.
+        """
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
-        heights = [0.002 + 0.02 * index for index in range(count)]
-        return [self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT) for height in heights]
+        for _ in range(HEAP_TRIALS):
+            falling: list[PlacedSolid] = []
+            height = DROP_HEIGHT
+            for _ in range(count):
+                falling.append(self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT))
+                corners = transform(falling[-1].T_base_obj, self.body.hull.vertices)
+                height = float(corners[:, 2].max()) + DROP_HEIGHT
+            starts = np.stack([item.T_base_obj for item in falling])
+            poses = settle([self.body.pieces] * count, starts, (), self.part.diameter)
+            if poses is not None:
+                placed = zip(falling, poses, strict=True)
+                return [replace(item, T_base_obj=pose) for item, pose in placed]
+        problem = f"a heap of part {self.part.name}, which does not come to rest"
+        allowed = "parts that do not roll on the bench"
+        raise UserError(problem, allowed, "pass --layout single or distractors")
 
 
 def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:

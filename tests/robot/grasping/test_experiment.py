@@ -11,7 +11,9 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.pool import LostWorkerError, ProcessPool
 from dopepp.robot.grasping import grasp_experiment
 from dopepp.robot.grasping.grasp_experiment import (
+    HeapCounts,
     check_task,
+    count_heaps,
     count_records,
     markdown,
     parse_sources,
@@ -69,6 +71,25 @@ def test_all_formats_hold_every_trial(records, tmp_path):
     assert (tmp_path / "grasps.md").read_text().count("\n") > 10
 
 
+def test_heaps_are_counted_by_their_last_attempt():
+    def attempts(number, *lifted, parts=3):
+        for attempt, count in enumerate(lifted, 1):
+            caught, failure = count > 0, "" if count else "slipped"
+            part = record(number, caught=caught, failure=failure)
+            yield replace(part, attempt=attempt, parts=parts, lifted=count)
+            parts -= count
+
+    # A heap emptied in four attempts, one in two with a double catch, and one left with a part.
+    heaps = [*attempts(0, 1, 0, 1, 1), *attempts(1, 2, 1), *attempts(2, 0, 1, 0, 1, 0, 0)]
+    assert count_heaps(heaps[::-1]) == HeapCounts(3, emptied=2, parts=9, lifted=8, attempts=12)
+    text = markdown(heaps, {})
+    assert "| network | 3 | 66.7 % (20.8 – 93.9) | 8 of 9 | 66.7 % (20.8 – 93.9) |" in text
+    row = next(line for line in text.splitlines() if line.startswith("| network | 12 |"))
+    assert "58.3 %" in row  # 7 of 12 attempts
+    assert row.endswith("| 0 | 0 | 0 | 0 | 5 |")
+    assert "Table 9" not in text
+
+
 TASK = GraspTask(sources=(PoseSource("exact"),))
 
 
@@ -76,8 +97,8 @@ TASK = GraspTask(sources=(PoseSource("exact"),))
 def test_two_processes_and_one_process_run_equal_trials(trials):
     source = TASK.sources[0]
     expected = [trials.attempt(trials.scene(number), source).record for number in (0, 1)]
-    records = sorted(run_trials(TASK, 2, workers=2), key=lambda record: record.number)
-    for record, other in zip(records, expected, strict=True):
+    records = sorted(run_trials(TASK, 2, workers=2), key=lambda trial: trial[0].number)
+    for (record,), other in zip(records, expected, strict=True):
         assert (record.number, record.caught) == (other.number, other.caught)
         assert record.hand_eye_mm == pytest.approx(other.hand_eye_mm, rel=1e-3)
 

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _sample_path
-from dopepp.robot.grasping.grasp_trial import PoseSource, SceneObservation, Trials
+from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
-from dopepp.robot.grasping.planner import align_with_bench
+from dopepp.robot.grasping.planner import DISTURBING, LOW, align_with_bench
+from dopepp.robot.grasping.selection import EstimatedPart
 
 
 @pytest.fixture
@@ -32,7 +33,8 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
 
 
 def test_a_part_at_another_pose_is_not_caught(trials, scene, monkeypatch):
-    aside = [pose @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for pose in scene.targets]
+    shift = make_transform(np.eye(3), [0.0, 0.05, 0.0])
+    aside = [EstimatedPart(pose @ shift) for pose in scene.targets]
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation(aside, scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert not record.caught
@@ -44,6 +46,41 @@ def test_no_estimated_pose_is_the_failure_not_seen(trials, scene, monkeypatch):
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation([], scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
     assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
+
+
+class Attempts(Trials):
+    """Trials of a heap of three parts whose attempts have given results."""
+
+    def __init__(self, *results):
+        self.task, self.results, self.failed = GraspTask(layout="heap"), list(results), []
+
+    def attempt(self, scene, source, failed=()):
+        failure, lifted = self.results.pop(0)
+        self.failed.append(len(failed))
+        record, outcome = SimpleNamespace(failure=failure), SimpleNamespace(lifted=(0,) * lifted)
+        return SimpleNamespace(scene=scene, record=record, outcome=outcome, estimate=np.eye(4))
+
+    def _look_again(self, attempt):
+        scene, lifted = attempt.scene, attempt.outcome.lifted
+        return SimpleNamespace(attempt=scene.attempt + 1, parts=scene.parts[len(lifted) :])
+
+
+@pytest.mark.parametrize(
+    ("results", "number"),
+    [
+        ([("", 1), ("slipped", 0), ("", 1), ("", 1), ("", 1)], 4),
+        ([("", 2), ("", 1), ("", 1)], 2),
+        ([("slipped", 0)] * 9, 6),
+        ([("no plan", 0), ("", 1), ("no plan", 0), ("no plan", 0), ("", 1)], 4),
+    ],
+    ids=["empty", "two parts at once", "no attempts left", "no plan twice"],
+)
+def test_a_heap_is_tried_until_it_is_empty_or_attempts_are_used_up(results, number):
+    trials = Attempts(*results)
+    attempts = list(trials.attempts(SimpleNamespace(attempt=1, parts=[0, 1, 2]), None))
+    assert len(attempts) == number
+    failures = [bool(failure) for failure, _ in results[:number]]
+    assert trials.failed == [sum(failures[:before]) for before in range(number)]
 
 
 def test_a_trial_depends_on_the_seed_alone(trials, scene):
@@ -93,7 +130,7 @@ def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is
     flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
     tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     estimate = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
-    aligned = align_with_bench(estimate, trials.layout.body.hull, bench)
+    aligned = align_with_bench(estimate, trials.layout.body.hull, bench, LOW["single"])
     if is_aligned:
         np.testing.assert_allclose(aligned[:3, 2], [0, 0, 1], atol=1e-9)
         assert aligned[2, 3] == pytest.approx(0.0235, abs=1e-9)
@@ -102,16 +139,38 @@ def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is
         np.testing.assert_array_equal(aligned, estimate)
 
 
-def test_a_plan_avoids_another_part(trials, part):
-    knowledge = trials.robot(0)[1].knowledge
-    scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=knowledge))
-    crowded = Trials(replace(trials.task, layout="heap"))
-    planner = crowded._planner(scene)
-    lower = make_transform(np.eye(3), TRAY + np.array([0, 0, 0.0035]))
+@pytest.fixture(scope="module")
+def crowded(trials):
+    """A planner for heaps."""
+    scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=trials.robot(0)[1].knowledge))
+    return Trials(replace(trials.task, layout="heap"))._planner(scene)
+
+
+LOWER = make_transform(np.eye(3), TRAY + np.array([0, 0, 0.0035]))
+ACROSS = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
+
+
+def test_a_plan_avoids_another_part(crowded):
     over = make_transform(np.eye(3), TRAY + np.array([0, 0.02, 0.012]))
-    across = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
-    assert planner.plan([lower], across, HOME) is not None
-    assert planner.plan([lower, over], across, HOME) is None
+    assert crowded.plan([LOWER], ACROSS, HOME) is not None
+    assert crowded.plan([LOWER, over], ACROSS, HOME) is None
+
+
+def test_closing_fingers_stay_above_a_part_that_sticks_out_below(crowded, trials):
+    # The lower part is beside the open fingers, but between the closed fingers.
+    above = make_transform(np.eye(3), TRAY + np.array([0, 0.004, 0.0106]))
+    plan = crowded.plan([above, LOWER], ACROSS, HOME)
+    ends = trials.arm.flange(plan.descent[-1])[2, 3] - trials.gripper.reach(plan.grasp.width)
+    assert 0.007 < ends < 0.0106
+
+
+def test_a_lift_that_moves_a_part_on_top_reduces_the_quality(crowded):
+    left = [replace(ACROSS[0], point=np.array([-0.02, 0, 0]))]
+    crossed = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    on_top = make_transform(crossed, TRAY + np.array([0.045, 0, 0.0107]))
+    free, loaded = (crowded.plan(poses, left, HOME) for poses in ([LOWER], [LOWER, on_top]))
+    assert free.quality > 0.9
+    assert loaded.quality == pytest.approx(DISTURBING * free.quality, rel=0.01)
 
 
 def test_a_motion_passes_its_waypoints_from_rest_to_rest(scene):

@@ -1,0 +1,78 @@
+"""The part to pick: a probable pose, a good grasp, little on top, and no failed attempt before."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dopepp.geometry.camera import make_transform
+from dopepp.robot.grasping.cell import HOME
+from dopepp.robot.grasping.selection import (
+    EstimatedPart,
+    choose_part,
+    covered_share,
+    pick_score,
+)
+
+GRID = np.stack(np.meshgrid(np.arange(0, 0.1, 0.002), np.arange(0, 0.05, 0.002), [0.0]), -1)
+PLATE = GRID.reshape(-1, 3)  # a flat plate of 100 × 50 mm, points 2 mm apart
+
+
+def at(x, z, turn=0.0):
+    c, s = np.cos(turn), np.sin(turn)
+    return make_transform(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([x, 0.0, z]))
+
+
+@pytest.mark.parametrize(("shift", "share"), [(0.0, 1.0), (0.05, 0.5), (0.08, 0.2), (0.2, 0.0)])
+def test_the_covered_share_is_that_of_two_shifted_plates(shift, share):
+    lower, upper = at(0.0, 0.0), at(shift, 0.01)
+    # Points within 3 mm of the upper plate's edge count as covered.
+    assert covered_share(lower, [upper], PLATE) == pytest.approx(share, abs=0.05)
+    assert covered_share(upper, [lower], PLATE) == 0
+    assert covered_share(lower, [], PLATE) == 0
+
+
+def test_the_score_falls_with_each_of_its_four_reasons():
+    best = pick_score(0.9, 0.8, 0.0, 0)
+    assert best == pytest.approx(0.72)
+    assert pick_score(0.9, 0.8, 0.25, 0) == pytest.approx(0.54)
+    worse = pick_score(0.5, 0.8, 0, 0), pick_score(0.9, 0.4, 0, 0), pick_score(0.9, 0.8, 0, 1)
+    assert max(worse) < best
+    assert pick_score(0.9, 0.8, 1.0, 0) == 0
+
+
+class FakePlanner:
+    """Planner whose grasps have the quality that is listed for the height of the part, mm."""
+
+    def __init__(self, **qualities):
+        self.qualities = {int(name[1:]): quality for name, quality in qualities.items()}
+        self.planned = []
+
+    def plan(self, poses, grasps, start):
+        height = round(1000 * poses[0][2, 3])
+        self.planned.append(height)
+        quality = self.qualities.get(height)
+        return None if quality is None else SimpleNamespace(quality=quality)
+
+
+def choose(planner, parts, failed=()):
+    choice = choose_part(planner, parts, PLATE, [], HOME, failed)
+    return choice and choice.number
+
+
+def test_the_upper_of_two_parts_is_chosen_unless_its_pose_is_unlikely_or_it_has_no_grasp():
+    lower, upper = EstimatedPart(at(0.0, 0.0), 0.9), EstimatedPart(at(0.02, 0.01), 0.9)
+    planner = FakePlanner(z0=1.0, z10=0.9)
+    assert choose(planner, [lower, upper]) == 1
+    assert planner.planned == [10]  # the covered part cannot score more
+    assert choose(planner, [lower, EstimatedPart(upper.T_base_obj, 0.05)]) == 0
+    assert choose(FakePlanner(z0=1.0), [lower, upper]) == 0
+    assert choose(FakePlanner(), [lower, upper]) is None
+
+
+def test_a_part_that_was_not_grasped_is_tried_after_the_others_until_it_moves():
+    parts = [EstimatedPart(at(0.0, 0.0)), EstimatedPart(at(0.3, 0.001), 0.8)]
+    planner = FakePlanner(z0=1.0, z1=1.0)
+    assert choose(planner, parts) == 0
+    assert choose(planner, parts, [at(0.002, 0.0)]) == 1
+    assert choose(planner, parts, [at(0.02, 0.0)]) == 0
