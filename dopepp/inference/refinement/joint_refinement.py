@@ -31,6 +31,7 @@ from dopepp.inference.refinement.region import (
     search_distance,
 )
 from dopepp.inference.refinement.region.round import OutlineAgreement, Round
+from dopepp.inference.refinement.region.shifts import FOLLOWED, FOUND, Weights
 from dopepp.inference.refinement.solver import (
     NormalEquations,
     PoseMatrix,
@@ -142,6 +143,7 @@ def refine_views(
     start: Prior,
     prior: Prior,
     surface: SurfacePoints | None = None,
+    followed: bool = False,
 ) -> JointRefinement:
     """Refine a pose in the world on all views that show the part's outline.
 
@@ -151,15 +153,17 @@ def refine_views(
         start: Pose in the world from which the search starts; its information limits the search.
         prior: Distribution of the pose before the images' outlines are used.
         surface: Surface points of the part, for views with depth.
+        followed: Whether the part was refined on the previous images.
 
     Raises:
         UndecidedError: No view shows the part's outline, at the start or later.
     """
-    covariance = np.linalg.inv(start.information)
+    covariance, weights = np.linalg.inv(start.information), FOLLOWED if followed else FOUND
     searches: list[_ViewSearch] = []
     for number, view in enumerate(views):
         try:
-            searches.append(_ViewSearch(number, view, region, start.T_cam_obj, covariance))
+            given = number, view, region, start.T_cam_obj, covariance, weights
+            searches.append(_ViewSearch(*given))
         except UndecidedError:
             continue
         if surface is not None and view.depth is not None:
@@ -202,10 +206,11 @@ class _ViewSearch:
         region: RegionRefiner,
         T_world_obj: Transform,
         covariance: PoseMatrix,
+        weights: Weights,
     ) -> None:
         self.number, self._view = number, view
         self._start = view.to_camera(T_world_obj, covariance)
-        rounds = region.rounds(view.image, view.K, self._start.T_cam_obj)
+        rounds = region.rounds(view.image, view.K, self._start.T_cam_obj, weights)
         self._reach = search_distance(rounds[0], self._start)
         self.rounds: Sequence[Round] = necessary_rounds(rounds, self._reach)
         self._depth: list[Term] = []

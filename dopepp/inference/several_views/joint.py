@@ -8,7 +8,7 @@ best single view.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -23,7 +23,7 @@ from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
-from dopepp.recovery.detection import log_odds
+from dopepp.recovery.detection import Detection, log_odds
 
 SUPPORTING: Final = 0.2
 """Smallest probability at which a view supports a pose."""
@@ -77,8 +77,8 @@ class JointEstimator:
         geometries: Mapping[str, PartGeometry],
         slope: float,
     ) -> None:
-        self._refiner, self._views, self._names = refiner, views, names
-        self._geometries, self._slope = geometries, slope
+        self._refiner, self.views, self.names = refiner, views, names
+        self.geometries, self._slope = geometries, slope
 
     def parts(self, clusters: Sequence[Sequence[PartObservation]]) -> list[JointPart]:
         """Estimate one part per cluster of observations, drop duplicates, and sort by score.
@@ -108,8 +108,8 @@ class JointEstimator:
             The part with the observations that agree with the joint pose. If no two views agree,
             the pose is that of the best observation.
         """
-        name, all_views = observations[0].detection.object, set(range(len(self._views)))
-        geometry = self._geometries[name]
+        name, all_views = observations[0].detection.object, set(range(len(self.views)))
+        geometry = self.geometries[name]
         # Refine on the selected views, select the views that support the result, and repeat.
         selected, tried = all_views, list[tuple[set[int], int]]()
         while len(selected) > 1 and (selected, len(observations)) not in tried:
@@ -121,7 +121,7 @@ class JointEstimator:
             starts = [item.start for item in observations if item.view in selected]
             prior = geometry.mean(starts or [observations[0].start])
             try:
-                views = [self._views[number] for number in numbers]
+                views = [self.views[number] for number in numbers]
                 joint = self._refiner.refine_views(name, views, search_range, prior)
             except UndecidedError:
                 break
@@ -159,10 +159,92 @@ class JointEstimator:
         evidence = [
             self._evidence(number, best.pose, [best], None)
             if number != best.view
-            else ViewEvidence(self._names[number], "supports", probability, detection)
+            else ViewEvidence(self.names[number], "supports", probability, detection)
             for number in all_views
         ]
         return self._part([best], best.pose, evidence)
+
+    def follow(self, part: WorldDetection, forecast: Prior) -> WorldDetection | None:
+        """Refine a tracked part on all views that show it, without a search in single views.
+
+        Views whose outline agrees less than :data:`AGREEING` are excluded, e.g. if the part is
+        occluded there. The part keeps its score and its probabilities.
+
+        Args:
+            part: The part in the previous images, with evidence of the same views.
+            forecast: Predicted pose in the world, with its uncertainty.
+
+        Returns:
+            The part, or None if no view shows it.
+        """
+        shown = dict[int, OutlineAgreement | None]()
+        supporting = set(range(len(self.views)))
+        selected: set[int] = set()
+        while supporting and supporting != selected:
+            selected = supporting
+            try:
+                views = [self.views[number] for number in sorted(selected)]
+                joint = self._refiner.refine_views(part.object, views, forecast, forecast, True)
+            except UndecidedError:
+                return None
+            shown |= dict(zip(sorted(selected), joint.agreements, strict=True))
+            supporting = {n for n in selected if (item := shown[n]) and item.share >= AGREEING}
+        if not supporting:
+            return None
+        covariance = joint.covariance * max(1.0, *joint.disagreements) ** 2
+        pose = Prior(joint.T_world_obj, np.linalg.inv(covariance))
+        return self.moved(part, pose, shown, supporting, max(joint.disagreements))
+
+    def moved(
+        self,
+        part: WorldDetection,
+        pose: Prior,
+        agreements: Mapping[int, OutlineAgreement | None],
+        supporting: Set[int],
+        disagreement: float,
+    ) -> WorldDetection:
+        """Return a part at another pose.
+
+        Args:
+            part: The part, with evidence of the same views.
+            pose: New pose in the world.
+            agreements: Agreement of the outline at the new pose, by index of the view.
+            supporting: Indices of the views that show the part.
+            disagreement: See :class:`WorldDetection`.
+        """
+        evidence = []
+        for number, item in enumerate(part.evidence):
+            detection = self._in_view(number, pose, item.detection, agreements.get(number))
+            status = "supports" if number in supporting else self._unsupported(number, detection)
+            evidence.append(replace(item, status=status, detection=detection))
+        return replace(
+            part,
+            T_world_obj=pose.T_cam_obj,
+            covariance=np.linalg.inv(pose.information),
+            evidence=evidence,
+            disagreement=disagreement,
+        )
+
+    def _in_view(
+        self, number: int, pose: Prior, detection: Detection, agreement: OutlineAgreement | None
+    ) -> Detection:
+        """Return a detection in the camera of a view, at a pose in the world."""
+        view = self.views[number]
+        distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
+        T_cam_obj, cuboid = distribution.T_cam_obj, self.geometries[detection.object].cuboid
+        return replace(
+            detection,
+            T_cam_obj=T_cam_obj,
+            keypoints=project_keypoints(cuboid, T_cam_obj, view.K),
+            covariance=np.linalg.inv(distribution.information),
+            agreement=None if agreement is None else agreement.share,
+            support=None if agreement is None else agreement.support,
+        )
+
+    def _unsupported(self, number: int, detection: Detection) -> Status:
+        """Return why a view does not support a pose: it is outside the image, or hidden."""
+        centre, size = detection.keypoints[CENTROID], self.views[number].image.shape[1::-1]
+        return "hidden" if ((centre >= 0) & (centre < size)).all() else "outside"
 
     def _evidence(
         self,
@@ -172,20 +254,13 @@ class JointEstimator:
         agreement: OutlineAgreement | None,
     ) -> ViewEvidence:
         """Return the visibility and probability in one view of a part at a pose in the world."""
-        view = self._views[number]
+        view = self.views[number]
         observation = next((item for item in observations if item.view == number), None)
-        distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
         original = observations[0].detection if observation is None else observation.detection
-        geometry = self._geometries[original.object]
-        detection = replace(
-            original,
-            T_cam_obj=distribution.T_cam_obj,
-            keypoints=project_keypoints(geometry.cuboid, distribution.T_cam_obj, view.K),
-            peaks=np.full_like(original.peaks, np.nan) if observation is None else original.peaks,
-            covariance=np.linalg.inv(distribution.information),
-            agreement=None if agreement is None else agreement.share,
-            support=None if agreement is None else agreement.support,
-        )
+        geometry = self.geometries[original.object]
+        detection = self._in_view(number, pose, original, agreement)
+        if observation is None:
+            detection = replace(detection, peaks=np.full_like(original.peaks, np.nan))
         detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
@@ -196,11 +271,9 @@ class JointEstimator:
         is_shown = agreement is not None and probability >= least and share >= least_share
         if observation is not None and original.kept:
             is_shown |= geometry.separation(pose, observation.pose) <= CONSISTENT
-        status: Status = "supports" if is_shown else "hidden"
-        centre = detection.keypoints[CENTROID]
-        if not ((centre >= 0) & (centre < view.image.shape[1::-1])).all():
-            status = "outside"
-        return ViewEvidence(self._names[number], status, probability, detection)
+        status = self._unsupported(number, detection)
+        status = "supports" if is_shown and status == "hidden" else status
+        return ViewEvidence(self.names[number], status, probability, detection)
 
     def _part(
         self,
