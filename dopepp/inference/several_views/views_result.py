@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import cv2
 import numpy as np
 
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Step, Transform
 from dopepp.inference.pose_result import PoseResult
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
@@ -101,11 +103,24 @@ class ViewsResult:
     velocities: Sequence[Step] | None = None
 
     @property
+    def num_weaker(self) -> int:
+        """Number of weaker detections."""
+        return len(self.weaker)
+
+    @property
     def summary(self) -> str:
         """Number of parts, and the number of views that show each part, in words."""
         count, shares = len(self.detections), [len(item.views) for item in self.detections]
         shown = ", ".join(f"{share} of {len(self.views)} views" for share in shares)
         return f"{count} part{'s' * (count > 1)}: {shown}" if count else "nothing found"
+
+    def plot(self) -> RGBImage:
+        """Return the drawn images of all views side by side, each as high as the first."""
+        images = [view.plot() for view in self.views]
+        height = images[0].shape[0]
+        sizes = [(round(image.shape[1] * height / image.shape[0]), height) for image in images]
+        resized = [cv2.resize(image, size) for image, size in zip(images, sizes, strict=True)]
+        return np.ascontiguousarray(np.hstack(resized))
 
     def records(self) -> list[dict[str, Any]]:
         """Return each detection as a dictionary for JSON, with its identity if it is tracked."""
