@@ -49,14 +49,13 @@ def shots(stereo, messages):
     """Return a function that makes the shots of a set."""
 
     def shots(second=1.0, lag=0.004):
-        info = messages.info(stereo.K, (640, 480), d=[0.0] * 5)
-        frames = [topic.split("/")[1] + "_optical_frame" for topic in TOPICS]
-        return [
-            Shot(messages.image(image, second + number * lag, frame), info, topic)
-            for number, (image, frame, topic) in enumerate(
-                zip(stereo.images, frames, TOPICS, strict=True)
-            )
-        ]
+        made = []
+        for number, (image, topic) in enumerate(zip(stereo.images, TOPICS, strict=True)):
+            frame = topic.split("/")[1] + "_optical_frame"
+            message = messages.image(image, second + number * lag, frame)
+            info = messages.info(stereo.K, (640, 480), d=[0.0] * 5, header=message.header)
+            made.append(Shot(message, info, topic))
+        return made
 
     return shots
 
