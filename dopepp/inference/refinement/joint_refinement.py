@@ -135,6 +135,7 @@ class JointRefinement:
     agreements: Sequence[OutlineAgreement | None]  # of each view; None without the outline
     # Mahalanobis distance per √degree of freedom between each view and all other views
     disagreements: Sequence[float]
+    informations: Sequence[PoseMatrix]  # added by each view, world axes
 
 
 def refine_views(
@@ -188,8 +189,11 @@ def refine_views(
     owners = [search.number for search in searches for _ in search.terms(1)]
     distances = _disagreements(end, prior, owners)
     disagreements = [distances.get(number, 0.0) for number in range(len(views))]
+    informations = [np.zeros((6, 6)) for _ in views]
+    for number, equations in zip(owners, end.equations, strict=True):
+        informations[number] += equations[0]
     covariance = np.linalg.inv(end.information)
-    return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements)
+    return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements, informations)
 
 
 class _ViewSearch:

@@ -17,10 +17,14 @@ import numpy as np
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.network_input import are_same
-from dopepp.inference.refinement.joint_refinement import PosedImage
+from dopepp.inference.refinement.joint_refinement import (
+    JointRefinement,
+    PosedImage,
+    rotate_covariance,
+)
 from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
-from dopepp.inference.refinement.solver import Prior, UndecidedError
+from dopepp.inference.refinement.solver import PoseMatrix, Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
 from dopepp.recovery.detection import Detection, log_odds
@@ -45,6 +49,9 @@ AGAINST: Final = -1.5
 COINCIDENCE: Final = 1.5
 """Log odds added by each further view that detects the part at the same pose, or whose outline
 agrees: wrong poses rarely fit two views."""
+
+REGULAR: Final = 1e-3
+"""Share of a forecast's information that keeps the information of the views invertible."""
 
 USUAL_MOVE: Final = 1.0
 """Assumed Mahalanobis distance between start and refined pose, a feature of the verification."""
@@ -164,7 +171,9 @@ class JointEstimator:
         ]
         return self._part([best], best.pose, evidence)
 
-    def follow(self, part: WorldDetection, forecast: Prior) -> WorldDetection | None:
+    def follow(
+        self, part: WorldDetection, forecast: Prior
+    ) -> tuple[WorldDetection, PoseMatrix] | None:
         """Refine a tracked part on all views that show it, without a search in single views.
 
         Views whose outline agrees less than :data:`AGREEING` are excluded, e.g. if the part is
@@ -175,7 +184,8 @@ class JointEstimator:
             forecast: Predicted pose in the world, with its uncertainty.
 
         Returns:
-            The part, or None if no view shows it.
+            The part, and its covariance without the lasting errors of the camera poses, from which
+            a filter continues. None if no view shows the part.
         """
         shown = dict[int, OutlineAgreement | None]()
         supporting = set(range(len(self.views)))
@@ -192,8 +202,10 @@ class JointEstimator:
         if not supporting:
             return None
         covariance = joint.covariance * max(1.0, *joint.disagreements) ** 2
-        pose = Prior(joint.T_world_obj, np.linalg.inv(covariance))
-        return self.moved(part, pose, shown, supporting, max(joint.disagreements))
+        lasting = covariance + _lasting_error(joint, views, forecast)
+        pose = Prior(joint.T_world_obj, np.linalg.inv(lasting))
+        moved = self.moved(part, pose, shown, supporting, max(joint.disagreements))
+        return moved, covariance
 
     def moved(
         self,
@@ -303,6 +315,23 @@ class JointEstimator:
         covariance = np.linalg.inv(pose.information)
         given = best.object, score, _probability(odds), pose.T_cam_obj, covariance
         return JointPart(observations, WorldDetection(*given, evidence, disagreement))
+
+
+def _lasting_error(
+    joint: JointRefinement, views: Sequence[PosedImage], forecast: Prior
+) -> PoseMatrix:
+    """Return the covariance of a tracked pose due to the errors of the camera poses, world axes.
+
+    These errors are the same on all images, so a filter does not reduce them. If errors e of the
+    views with information W pull at the pose, the pose of a part at rest is (Σ W)⁻¹ Σ W e.
+    """
+    total, pulled = REGULAR * forecast.information, np.zeros((6, 6))
+    for view, W in zip(views, joint.informations, strict=True):
+        error = view.error_at(view.pose(joint.T_world_obj)[:3, 3])
+        total = total + W
+        pulled += W @ rotate_covariance(view.T_cam_world[:3, :3].T, error) @ W
+    gain = np.linalg.inv(total)
+    return np.asarray(gain @ pulled @ gain.T)
 
 
 def _is_duplicate(part: JointPart, better: JointPart) -> bool:

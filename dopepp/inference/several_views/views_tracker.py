@@ -8,6 +8,7 @@ tracker of one camera would run it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -72,8 +73,11 @@ class ViewsTracker(Tracker[WorldDetection]):
         self, estimate: Estimate[WorldDetection], forecast: Motion
     ) -> Estimate[WorldDetection] | None:
         with self.estimator.timed("refine"):
-            part = self._joint.follow(estimate.detection, _prior(forecast))
-        return None if part is None else _estimate(part, part.agreement)
+            followed = self._joint.follow(estimate.detection, _prior(forecast))
+        if followed is None:
+            return None
+        part, covariance = followed
+        return replace(_estimate(part, part.agreement), covariance=covariance)
 
     def _moved(
         self, estimate: Estimate[WorldDetection], forecast: Motion, agreement: float
