@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from typer import Argument, Option
@@ -26,6 +26,11 @@ from dopepp.cli.common import (
     resumable,
 )
 from dopepp.core.errors import UserError, require
+from dopepp.core.validation import Range, check
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
 LINES: Final = ("--json", "--udp")
 
@@ -45,7 +50,24 @@ def node(
     out: Annotated[Path | None, Option(help="With --bag: recording to write, .mcap")] = None,
     json_lines: Annotated[bool, Option("--json", help="Print lines of JSON.")] = False,
     udp: Annotated[str | None, Option(help="HOST:PORT: send the lines over UDP.")] = None,
-    topic: Annotated[str | None, Option(help="Image topic (default: /camera/image_raw).")] = None,
+    topic: Annotated[
+        list[str] | None,
+        Option(
+            help="Image topic (default: /camera/image_raw). With --ros2: several topics of cameras "
+            "with known poses."
+        ),
+    ] = None,
+    views: Annotated[
+        Path | None,
+        Option(help="With several topics: file of the camera poses (default: poses from TF)."),
+    ] = None,
+    world: Annotated[
+        str | None, Option(help="With several topics: frame of the poses (default: world).")
+    ] = None,
+    lag: Annotated[
+        float | None,
+        Option(help="With several topics: largest lag of a set's images, seconds (default: 1/60)."),
+    ] = None,
     name: Annotated[str, Option(help="Name of the node and prefix of its topics.")] = "dope",
     params: Annotated[Path | None, Option(help="With --ros2: YAML of parameters.")] = None,
     intrinsics: Intrinsics = None,
@@ -73,6 +95,10 @@ def node(
         transports = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
         chosen = [option for option, is_given in transports.items() if is_given]
         transport = _check_transport(chosen, words, out, params)
+        topics = topic or [TOPIC]
+        for_several: dict[str, object] = {"--views": views, "--world": world, "--lag": lag}
+        for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
+        _check_topics(topics, transport, for_one if len(topics) > 1 else for_several)
         check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
@@ -84,19 +110,24 @@ def node(
         from dopepp.inference.frames import open_sources
         from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
-        sources = open_sources(words, topic) if transport in LINES else []
+        sources = open_sources(words, topics[0] if topic else None) if transport in LINES else []
         cameras = [fixed_camera or choose_camera(None, None, opened) for opened in sources]
         estimator = load_estimator(
             model, device, unit, working_distance, tilt, max_ms=max_ms, scale_error=scale_error
         )
-        if track or refine:
+        if track or refine or len(topics) > 1:
             estimator = estimator.refining("region")
         settings = WorkerSettings(conf, estimator.refiner is not None, overlay)
-        worker = Worker(estimator, settings, fixed_camera, frame, track)
+        if len(topics) > 1:
+            worker = _views_worker(estimator, settings, topics, views, world, track)
+        else:
+            worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":
+            from dopepp.robot.nodes.pairing import MAX_LAG_S
             from dopepp.robot.nodes.ros2 import run
 
-            run(worker, topic or TOPIC, name, params)
+            max_lag_s = check("--lag", MAX_LAG_S if lag is None else lag, float, Range(0, 10))
+            run(worker, topics, name, params, max_lag_s)
             return
 
         from dopepp.robot.nodes.standalone import process_bag, send_lines
@@ -105,7 +136,7 @@ def node(
             send_lines(worker, zip(sources, cameras, strict=True), udp)
         elif bag is not None and out is not None:
             poses = weaker = processed = skipped = 0
-            for answer in process_bag(worker, bag, out, topic, name):
+            for answer in process_bag(worker, bag, out, topics[0] if topic else None, name):
                 if answer is None:
                     skipped += 1
                 else:
@@ -115,6 +146,39 @@ def node(
             note = f", {skipped} skipped" if skipped else ""
             note += f"; {weaker} weaker candidates" if weaker else ""
             typer.echo(f"{out}: {poses} poses in {processed} images{note}")
+
+
+def _views_worker(
+    estimator: PoseEstimator,
+    settings: WorkerSettings,
+    topics: Sequence[str],
+    views: Path | None,
+    world: str | None,
+    track: bool,
+) -> Worker:
+    """Return the worker for the images of several topics; see :func:`node` for the options."""
+    from dopepp.inference.several_views.view_files import read_camera_poses
+    from dopepp.robot.nodes.views_worker import WORLD, ViewsWorker
+
+    poses, error = None, None
+    if views is not None:
+        file = read_camera_poses(views)
+        error = file.error
+        poses = [file.of(Path(topic.removesuffix("/compressed"))) for topic in topics]
+    return ViewsWorker(estimator, poses, world or WORLD, error, settings, track)
+
+
+def _check_topics(topics: Sequence[str], transport: str, excluded: Mapping[str, object]) -> None:
+    """Reject topics that do not suit, and ``excluded`` options (values by name) that are set."""
+    if len(topics) > 1 and transport != "--ros2":
+        fix = "pass one --topic, or use --ros2"
+        raise UserError(f"{len(topics)} topics with {transport}", "one topic", fix)
+    if len(set(topics)) < len(topics):
+        fix = "pass the topic of another camera"
+        raise UserError(f"--topic {topics[0]} twice", "different topics", fix)
+    if given := ", ".join(option for option, value in excluded.items() if value is not None):
+        number = "several topics" if len(topics) > 1 else "one topic"
+        raise UserError(f"{given} with {number}", f"{number} without it", f"leave out {given}")
 
 
 def _check_transport(

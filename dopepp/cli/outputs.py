@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 from dopepp.core.errors import RunError, UserError, system_failure
 from dopepp.core.files import IMAGES, check_target, partial_path
@@ -22,43 +22,46 @@ if TYPE_CHECKING:
     from dopepp.drawing.pictures import VideoFile
     from dopepp.inference.frames import FrameSource
     from dopepp.inference.pose_result import PoseResult
+    from dopepp.inference.several_views.views_result import ViewsResult
 
 VIDEO: Final = ".mp4"
 
+Result = TypeVar("Result", contravariant=True)  # PoseResult, or ViewsResult
 
-class Output(Protocol):
+
+class Output(Protocol[Result]):
     """Writer of pose results to files, source by source."""
 
     def begin(self, source: FrameSource) -> None:
         """Prepare for the results of the next source, e.g. the frames of a video."""
 
-    def write(self, result: PoseResult) -> None:
+    def write(self, result: Result, /) -> None:
         """Write the poses in an image of the current source."""
 
     def close(self) -> None:
         """Finish and close the files; also called after an error, with the results so far."""
 
 
-class Outputs:
+class Outputs(Generic[Result]):
     """Group of outputs for a ``with`` block, which closes them; an OSError becomes a RunError."""
 
-    def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
+    def __init__(self, outputs: Sequence[tuple[Path, Output[Result]]]) -> None:
         self._outputs = outputs
 
     def begin(self, source: FrameSource) -> None:
         """Call :meth:`Output.begin` of each output."""
         self._each(lambda output: output.begin(source))
 
-    def write(self, result: PoseResult) -> None:
+    def write(self, result: Result) -> None:
         """Call :meth:`Output.write` of each output."""
         self._each(lambda output: output.write(result))
 
-    def _each(self, action: Callable[[Output], None]) -> None:
+    def _each(self, action: Callable[[Output[Result]], None]) -> None:
         for path, output in self._outputs:
             with _disk_errors(path):
                 action(output)
 
-    def __enter__(self) -> Outputs:
+    def __enter__(self) -> Outputs[Result]:
         return self
 
     def __exit__(
@@ -137,7 +140,7 @@ class JsonLines:
         """Open a partial file, unless it is open from a previous source."""
         self._file = self._file or self._partial.open("wb", buffering=0)
 
-    def write(self, result: PoseResult) -> None:
+    def write(self, result: PoseResult | ViewsResult) -> None:
         """Append a line for the image.
 
         Raises:

@@ -77,8 +77,8 @@ def predict(
     views: Annotated[
         Path | None,
         Option(
-            help="Camera poses, if all images show one static scene: views.yaml, BOP's "
-            "scene_camera.json or COLMAP's images.txt."
+            help="Camera poses, if all images show one static scene (with --track: the n-th image "
+            "of each source): views.yaml, BOP's scene_camera.json or COLMAP's images.txt."
         ),
     ] = None,
     verify: Annotated[
@@ -103,7 +103,7 @@ def predict(
     gc.disable()  # all imported objects stay alive; collecting them would slow down the start
     with resumable("the written files are complete"):
         from dopepp.cli.outputs import Outputs
-        from dopepp.cli.predict_scene import predict_scene
+        from dopepp.cli.predict_scene import predict_scene, track_scene
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
         from dopepp.inference.frames.source import choose_camera, given_camera
@@ -119,12 +119,13 @@ def predict(
         if track:
             _exclude("--track", {**excluded, "--distance": distance})
         if views is not None:
-            excluded |= {"--track": track, "--csv": csv, "--rerun": rerun, "--show": show}
+            excluded |= {"--csv": csv, "--rerun": rerun, "--show": show}
             excluded |= {"--crop": crop, "--K-size": K_size, "--topic": topic}
             _exclude("--views", {**excluded, "--stride": stride != 1})
         terms = ("region",) if track or views else terms
         outputs = _file_outputs(save, json_file, csv, stride)
-        sources = open_sources(source, topic)
+        words = [[word] for word in source] if track and views else [source]  # one for each camera
+        sources = [opened for group in words for opened in open_sources(group, topic)]
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         cameras = [] if views else [choose_camera(K, camera, opened) for opened in sources]
 
@@ -141,6 +142,9 @@ def predict(
         gc.enable()
         if views is not None:
             lens = given_camera(K, camera)
+            if track:
+                track_scene(estimator, sources, views, lens, save, json_file)
+                return
             predict_scene(estimator, sources, views, lens, distance, save, json_file)
             return
         if rerun is not None or show:
@@ -177,11 +181,11 @@ def _exclude(option: str, others: dict[str, object]) -> None:
 
 def _file_outputs(
     save: Path | None, json_file: Path | None, csv: Path | None, stride: int
-) -> list[tuple[Path, Output]]:
+) -> list[tuple[Path, Output[PoseResult]]]:
     """Return (path, output) pairs of the requested files; ``stride`` is the option's value."""
     from dopepp.cli.outputs import BopCsv, JsonLines, OverlayFolder
 
-    requests: tuple[tuple[Path | None, Callable[[Path], Output]], ...] = (
+    requests: tuple[tuple[Path | None, Callable[[Path], Output[PoseResult]]], ...] = (
         (save, lambda folder: OverlayFolder(folder, stride)),
         (json_file, JsonLines),
         (csv, BopCsv),
@@ -207,7 +211,7 @@ class _Session:
     ) -> None:
         self._estimator, self._options, self._verified = estimator, options, verified
 
-    def run(self, source: FrameSource, camera: Camera, outputs: Outputs) -> None:
+    def run(self, source: FrameSource, camera: Camera, outputs: Outputs[PoseResult]) -> None:
         """Print the poses in each image of a source, and pass them to the outputs."""
         from dopepp.inference.pose_result import format_speed
 

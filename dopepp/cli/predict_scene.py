@@ -1,21 +1,27 @@
-"""``dopepp predict --views``: poses in a world frame from several images of a static scene."""
+"""``dopepp predict --views``: poses in a world frame from images of several posed cameras."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
 from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
+    from dopepp.drawing.pictures import RGBImage
+    from dopepp.geometry.camera import Transform
     from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
-    from dopepp.inference.frames import FrameSource
+    from dopepp.inference.frames import CameraFrame, FrameSource
     from dopepp.inference.network_input import Distances
+    from dopepp.inference.several_views.view_files import CameraPoses
 
 
 def predict_scene(
@@ -52,25 +58,9 @@ def predict_scene(
         if any(source.rate is not None for source in sources):
             problem = "--views with a video, a recording or a camera"
         raise UserError(problem, "two images or more", "pass the images of one static scene")
-    paths = [Path(frame.name) for frame in frames]
-    names = [path.name for path in paths]
-    if len(set(names)) < len(names):  # images of one moment, in a folder for each camera
-        names = ["/".join(path.parts[-2:]) for path in paths]
-    shots = [poses.of(path) for path in paths]
-    cameras: list[Camera] = []
-    for frame, shot in zip(frames, shots, strict=True):
-        lens = shot.camera or camera
-        if lens is None:
-            fix = f"add `camera: FILE` to {views}, or pass --camera or --K"
-            raise UserError(f"no camera of {frame.name}", "a camera for every image", fix)
-        cameras.append(lens)
+    given = _posed(frames, poses, camera)
     result = estimator.predict_views(
-        [frame.image for frame in frames],
-        cameras,
-        [shot.T_world_cam for shot in shots],
-        distances=distances,
-        camera_error=poses.error,
-        names=names,
+        *given[:3], distances=distances, camera_error=poses.error, names=given.names
     )
     for record in result.records():
         typer.echo(json.dumps(record, ensure_ascii=False))
@@ -81,3 +71,97 @@ def predict_scene(
         result.save(save)
     if json_file is not None:
         write_file(json_file, f"{result.to_json()}\n".encode())
+
+
+def track_scene(
+    estimator: PoseEstimator,
+    sources: Sequence[FrameSource],
+    views: Path,
+    camera: Camera | None,
+    save: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Track the parts through synchronised sources; print and write the poses of each set.
+
+    Args:
+        estimator: Estimator that refines by region.
+        sources: Images or video of each camera. The n-th frames of all sources are a set.
+        views: File of the camera poses.
+        camera: Intrinsics of the images for which ``views`` names no camera file.
+        save: Folder for images or videos with drawn poses; None writes none.
+        json_file: File for a line of JSON for each set; None writes none.
+
+    Raises:
+        UserError: There are fewer than two sources, a source is a camera, the numbers of frames
+            differ, or an image has no pose or no camera.
+    """
+    from dopepp.cli.outputs import JsonLines, Outputs, OverlayFolder
+    from dopepp.inference.several_views.view_files import read_camera_poses
+    from dopepp.inference.several_views.views_tracker import ViewsTracker
+
+    counts = [source.count for source in sources]
+    problem = " and ".join(f"{source.name} with {source.count} frames" for source in sources)
+    differ = UserError(
+        f"--views with --track, and {problem}",
+        "two or more folders or videos with equal numbers of frames",
+        "pass a folder or a video of each camera, e.g. left/ right/",
+    )
+    if len(sources) < 2 or None in counts or len(set(counts)) > 1:
+        raise differ
+    poses, tracker = read_camera_poses(views), ViewsTracker(estimator)
+    lines = [] if json_file is None else [(json_file, JsonLines(json_file))]
+    with ExitStack() as files:
+        written, drawn = files.enter_context(Outputs(lines)), []
+        written.begin(sources[0])
+        if save is not None:
+            for number, source in enumerate(sources):
+                stem = source.stem if source.rate else Path(source.name).absolute().parent.name
+                folder = save / f"{number}_{stem}"
+                drawn.append(files.enter_context(Outputs([(folder, OverlayFolder(folder))])))
+                drawn[-1].begin(source)
+        for number, frames in enumerate(zip_longest(*(source.frames() for source in sources))):
+            if None in frames:  # a video whose header states more frames
+                raise differ
+            given = _posed(frames, poses, camera)
+            result = tracker.track(*given[:3], camera_error=poses.error, names=given.names)
+            for record in result.records():
+                typer.echo(json.dumps({"number": number, **record}, ensure_ascii=False))
+            for finding in result.findings:
+                typer.echo(finding, err=True)
+            typer.echo(f"{number + 1}/{counts[0]}: {result.summary}", err=True)
+            written.write(result)
+            for output, view, frame in zip(drawn, result.views, frames, strict=False):
+                output.write(replace(view, number=frame.number, time=frame.time))
+
+
+class _PosedFrames(NamedTuple):
+    """Images of one moment with their cameras."""
+
+    images: Sequence[RGBImage]
+    cameras: Sequence[Camera]
+    T_world_cam: Sequence[Transform]
+    names: Sequence[str]
+
+
+def _posed(
+    frames: Sequence[CameraFrame], poses: CameraPoses, camera: Camera | None
+) -> _PosedFrames:
+    """Return frames with their cameras; ``camera`` is used where the file names none.
+
+    Raises:
+        UserError: A frame has no pose or no camera.
+    """
+    paths = [Path(frame.name) for frame in frames]
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):  # images of one moment, in a folder for each camera
+        names = ["/".join(path.parts[-2:]) for path in paths]
+    shots = [poses.of(path) for path in paths]
+    cameras: list[Camera] = []
+    for frame, shot in zip(frames, shots, strict=True):
+        lens = shot.camera or camera
+        if lens is None:
+            fix = f"add `camera: FILE` to {poses.source}, or pass --camera or --K"
+            raise UserError(f"no camera of {frame.name}", "a camera for every image", fix)
+        cameras.append(lens)
+    images, T_world_cam = [frame.image for frame in frames], [shot.T_world_cam for shot in shots]
+    return _PosedFrames(images, cameras, T_world_cam, names)

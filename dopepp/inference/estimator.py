@@ -289,14 +289,14 @@ class PoseEstimator:
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Detection]:
         """Return the detections before refinement, best score first."""
-        with self._timed("pre"):
+        with self.timed("pre"):
             views = self.views(image, K, distances, roi)
         stride, options = self.network.stride, self._recovery_options(0.0)
         scales: list[list[Detection]] = []
         for view in views:
-            with self._timed("network"):
+            with self.timed("network"):
                 belief, field = self.maps(view.pixels)
-            with self._timed("decode"):
+            with self.timed("decode"):
                 detections = recover(
                     belief, field, self.cuboids, view.K, stride, self._names, **options
                 )
@@ -359,7 +359,7 @@ class PoseEstimator:
             return list(detections)
         refined: list[Detection] = []
         start = time.perf_counter()
-        with self._timed("refine"):
+        with self.timed("refine"):
             for detection in detections:
                 if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
                     unrefined = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
@@ -484,7 +484,7 @@ class PoseEstimator:
         return vars(replace(self.recovery, min_score=threshold))
 
     @contextmanager
-    def _timed(self, step: str) -> Iterator[None]:
+    def timed(self, step: str) -> Iterator[None]:
         """Add the block's time to that of a step, including its pending work on a GPU."""
         start = time.perf_counter()
         yield

@@ -137,7 +137,7 @@ class TemplateEstimator(PoseEstimator):
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Detection]:
         """Return start poses of all parts, best score first."""
-        with self._timed("decode"):
+        with self.timed("decode"):
             roi, depths = check_region(roi, image), self._range(distances)
             starts = [
                 start

@@ -213,12 +213,25 @@ def test_several_views_of_a_scene(run, tmp_path):
     folders = [tmp_path / name / "7.png" for name in "ab"]
     again = run("predict", RELEASED, *folders, "--views", tmp_path / "rig.yaml")
     assert [view["image"] for view in json.loads(again.stdout)["views"]] == ["a/7.png", "b/7.png"]
+    folders, rig_path = [tmp_path / name for name in "ab"], tmp_path / "rig.yaml"
+    for folder in folders:
+        shutil.copy(folder / "7.png", folder / "8.png")
+    command = ("predict", RELEASED, *folders, "--views", rig_path, "--track")
+    tracked = run(*command, "--save", tmp_path / "drawn", "--json", tmp_path / "sets.json")
+    lines = [json.loads(line) for line in tracked.stdout.splitlines()]
+    assert [(line["number"], line["identity"]) for line in lines] == [(0, 0), (1, 0)]
+    assert np.linalg.norm(np.array(lines[1]["T_world_obj"]) - target, axis=0)[3] < 5e-4
+    written = [json.loads(line) for line in (tmp_path / "sets.json").read_text().splitlines()]
+    assert [line["images"] for line in written] == [["a/7.png", "b/7.png"], ["a/8.png", "b/8.png"]]
+    files = {str(file.relative_to(tmp_path / "drawn")) for file in tmp_path.glob("drawn/*/*")}
+    assert files == {"0_a/7.png", "0_a/8.png", "1_b/7.png", "1_b/8.png"}
+    (folders[1] / "8.png").unlink()
+    assert "with 2 frames and" in run(*command, code=2).stderr
     views["b.png"]["T_world_cam"]["matrix"][0][3] += 0.05
     path.write_text(json.dumps({"camera": "K.txt", "views": views}))
     done = run("predict", RELEASED, *images, "--views", path)
     assert done.stdout == ""
     assert "a camera pose is wrong" in done.stderr
-    assert "--track" in run("predict", RELEASED, *images, "--views", path, "--track", code=2).stderr
     assert "two images" in run("predict", RELEASED, images[0], "--views", path, code=2).stderr
     path.write_text(json.dumps({"views": views}))
     assert "--camera" in run("predict", RELEASED, *images, "--views", path, code=2).stderr

@@ -9,15 +9,12 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform, move_pose, project_keypoints, step_between
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.motion import PERSISTENCE, SUDDEN, Motion, at_rest
 from dopepp.inference.tracker import (
     FORGOTTEN,
     OFTEN,
     PATIENCE,
-    PERSISTENCE,
-    SUDDEN,
-    Motion,
     PoseTracker,
-    at_rest,
 )
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
@@ -290,20 +287,20 @@ def test_update_is_the_kalman_update() -> None:
 
 def test_filter_predicts_a_steady_motion() -> None:
     step = np.array([0, math.radians(6), 0, 0.01, 0, 0])
-    motion, T = at_rest(START, np.diag(NOISE**2)), START
+    motion, T = at_rest(START, np.diag(NOISE**2), START[2, 3]), START
     for _ in range(15):
         T = move_pose(T, step)
-        motion = filtered(motion.predict(), T)
-    miss = step_between(motion.predict().T_cam_obj, move_pose(T, step))
+        motion = filtered(motion.predict(START[2, 3]), T)
+    miss = step_between(motion.predict(START[2, 3]).T_cam_obj, move_pose(T, step))
     assert np.abs(miss[:3]).max() < math.radians(0.5)
     assert np.abs(miss[3:]).max() < 0.001
 
 
 def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
     rng = np.random.default_rng(1)
-    motion, steps = at_rest(START, np.diag(NOISE**2)), []
+    motion, steps = at_rest(START, np.diag(NOISE**2), START[2, 3]), []
     for _ in range(80):
-        after = filtered(motion.predict(), move_pose(START, rng.normal(size=6) * NOISE))
+        after = filtered(motion.predict(START[2, 3]), move_pose(START, rng.normal(size=6) * NOISE))
         steps.append(step_between(motion.T_cam_obj, after.T_cam_obj))
         motion = after
     trembling = np.sqrt(np.mean(np.square(steps[20:]), axis=0) / 2)
@@ -313,9 +310,9 @@ def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
 
 @pytest.mark.parametrize("sudden", [False, True])
 def test_prediction_is_slower_and_less_certain(sudden: bool) -> None:
-    motion = at_rest(START, np.diag(NOISE**2))
+    motion = at_rest(START, np.diag(NOISE**2), START[2, 3])
     motion = Motion(START, np.array([0, 0, 0.02, 0.003, 0, 0]), motion.covariance, np.zeros(6))
-    later = motion.predict(sudden)
+    later = motion.predict(START[2, 3], sudden)
     assert_allclose(later.velocity, PERSISTENCE * motion.velocity)
     assert (np.diag(later.pose_covariance) > np.diag(motion.pose_covariance)).all()
     if sudden:

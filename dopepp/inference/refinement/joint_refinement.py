@@ -31,6 +31,7 @@ from dopepp.inference.refinement.region import (
     search_distance,
 )
 from dopepp.inference.refinement.region.round import OutlineAgreement, Round
+from dopepp.inference.refinement.region.shifts import FOLLOWED, FOUND, Weights
 from dopepp.inference.refinement.solver import (
     NormalEquations,
     PoseMatrix,
@@ -134,6 +135,7 @@ class JointRefinement:
     agreements: Sequence[OutlineAgreement | None]  # of each view; None without the outline
     # Mahalanobis distance per √degree of freedom between each view and all other views
     disagreements: Sequence[float]
+    informations: Sequence[PoseMatrix]  # added by each view, world axes
 
 
 def refine_views(
@@ -142,6 +144,7 @@ def refine_views(
     start: Prior,
     prior: Prior,
     surface: SurfacePoints | None = None,
+    followed: bool = False,
 ) -> JointRefinement:
     """Refine a pose in the world on all views that show the part's outline.
 
@@ -151,15 +154,17 @@ def refine_views(
         start: Pose in the world from which the search starts; its information limits the search.
         prior: Distribution of the pose before the images' outlines are used.
         surface: Surface points of the part, for views with depth.
+        followed: Whether the part was refined on the previous images.
 
     Raises:
         UndecidedError: No view shows the part's outline, at the start or later.
     """
-    covariance = np.linalg.inv(start.information)
+    covariance, weights = np.linalg.inv(start.information), FOLLOWED if followed else FOUND
     searches: list[_ViewSearch] = []
     for number, view in enumerate(views):
         try:
-            searches.append(_ViewSearch(number, view, region, start.T_cam_obj, covariance))
+            given = number, view, region, start.T_cam_obj, covariance, weights
+            searches.append(_ViewSearch(*given))
         except UndecidedError:
             continue
         if surface is not None and view.depth is not None:
@@ -184,8 +189,11 @@ def refine_views(
     owners = [search.number for search in searches for _ in search.terms(1)]
     distances = _disagreements(end, prior, owners)
     disagreements = [distances.get(number, 0.0) for number in range(len(views))]
+    informations = [np.zeros((6, 6)) for _ in views]
+    for number, equations in zip(owners, end.equations, strict=True):
+        informations[number] += equations[0]
     covariance = np.linalg.inv(end.information)
-    return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements)
+    return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements, informations)
 
 
 class _ViewSearch:
@@ -202,10 +210,11 @@ class _ViewSearch:
         region: RegionRefiner,
         T_world_obj: Transform,
         covariance: PoseMatrix,
+        weights: Weights,
     ) -> None:
         self.number, self._view = number, view
         self._start = view.to_camera(T_world_obj, covariance)
-        rounds = region.rounds(view.image, view.K, self._start.T_cam_obj)
+        rounds = region.rounds(view.image, view.K, self._start.T_cam_obj, weights)
         self._reach = search_distance(rounds[0], self._start)
         self.rounds: Sequence[Round] = necessary_rounds(rounds, self._reach)
         self._depth: list[Term] = []

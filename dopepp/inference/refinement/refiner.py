@@ -145,10 +145,15 @@ class Refiner:
         return self.verified(end, image, K, moved)
 
     def refine_views(
-        self, name: str, views: Sequence[PosedImage], start: Prior, prior: Prior
+        self,
+        name: str,
+        views: Sequence[PosedImage],
+        start: Prior,
+        prior: Prior,
+        followed: bool = False,
     ) -> JointRefinement:
         """Refine the pose of a part in the world; see :meth:`PartRefiner.refine_views`."""
-        return self._refiners[name].refine_views(views, start, prior)
+        return self._refiners[name].refine_views(views, start, prior, followed)
 
     def verified(
         self, detection: Detection, image: RGBImage, K: CameraMatrix, moved: float = 0.0
@@ -196,7 +201,11 @@ class PartRefiner:
         self._surface = surface_points(part.points) if has_surface else None
 
     def refine_views(
-        self, views: Sequence[PosedImage], start: Prior, prior: Prior
+        self,
+        views: Sequence[PosedImage],
+        start: Prior,
+        prior: Prior,
+        followed: bool = False,
     ) -> JointRefinement:
         """Refine a pose in the world on several images.
 
@@ -205,6 +214,7 @@ class PartRefiner:
             start: Pose in the world from which the search starts; its information limits the
                 search.
             prior: Distribution of the pose before the images' outlines are used.
+            followed: Whether the part was refined on the previous images.
 
         Raises:
             UndecidedError: The images do not determine the pose.
@@ -212,7 +222,7 @@ class PartRefiner:
         if self._region is None:
             raise UndecidedError("several views are refined only with refine=region")
         surface = self._surface if self._uses_depth else None
-        return refine_views(self._region, views, start, prior, surface)
+        return refine_views(self._region, views, start, prior, surface, followed)
 
     def refine(
         self,

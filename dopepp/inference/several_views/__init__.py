@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -22,10 +22,10 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform
+from dopepp.geometry.camera import CameraMatrix, Step, Transform, invert_transform
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import is_rigid
-from dopepp.inference.network_input import Depth, Distances, prepare_image
+from dopepp.inference.network_input import Depth, Distances, Region, prepare_image
 from dopepp.inference.pose_result import PoseResult, Shape, elapsed_by_step
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.contradictions import contradictions
@@ -36,7 +36,7 @@ from dopepp.inference.several_views.observations import (
     associate,
     make_observation,
 )
-from dopepp.inference.several_views.views_result import ViewsResult
+from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
@@ -57,6 +57,20 @@ def predict_views(
     names: Sequence[str] | None = None,
 ) -> ViewsResult:
     """Estimate the poses of parts on several images; see :meth:`PoseEstimator.predict_views`."""
+    given = images, cameras, T_world_cam, depths, camera_error, names
+    return search(estimator, joint_estimator(estimator, *given), distances)
+
+
+def joint_estimator(
+    estimator: PoseEstimator,
+    images: Sequence[RGBImage],
+    cameras: Sequence[Camera | CameraMatrix],
+    T_world_cam: Sequence[Transform],
+    depths: Sequence[Depth] | None = None,
+    camera_error: tuple[float, float] | None = None,
+    names: Sequence[str] | None = None,
+) -> JointEstimator:
+    """Return the estimator of joint poses on several images; see :func:`predict_views`."""
     refiner = estimator.refiner
     if refiner is None or not refiner.verifies:
         fix = "load the estimator with refine='region'"
@@ -65,27 +79,72 @@ def predict_views(
     names = names or [f"view {number}" for number in range(len(images))]
     error = CAMERA_ERROR if camera_error is None else camera_error
     views = _posed_images(images, cameras, T_world_cam, depths, error, names)
-    observations, speeds = _search(estimator, views, distances)
     geometries = {part.name: PartGeometry.of(part) for part in estimator.solid_parts}
-    associated = partial(associate, geometries=geometries)
-    slope, least = estimator.recovery.refined_verification, estimator.min_score
-    joint = JointEstimator(refiner, views, names, geometries, slope)
-    parts = [part.detection for part in joint.parts(associated(observations))]
+    slope = estimator.recovery.refined_verification
+    return JointEstimator(refiner, views, names, geometries, slope)
+
+
+def search(
+    estimator: PoseEstimator,
+    joint: JointEstimator,
+    distances: Distances | None = None,
+    regions: Sequence[Region | None] | None = None,
+) -> ViewsResult:
+    """Search for parts in each view alone, and estimate the poses of the parts from all views.
+
+    Args:
+        estimator: Estimator that refines by region.
+        joint: Estimator of joint poses on the views.
+        distances: See :meth:`PoseEstimator.predict`.
+        regions: Region to search in each view, None to search nothing (default: whole images).
+    """
+    before = dict(estimator.spent_ms)
+    observations = _observations(estimator, joint.views, distances, regions)
+    associated, least = partial(associate, geometries=joint.geometries), estimator.min_score
+    with estimator.timed("refine"):
+        parts = [part.detection for part in joint.parts(associated(observations))]
     strong = [[item for item in view if item.detection.score >= least] for view in observations]
     passed, findings = contradictions(
-        [part for part in parts if part.score >= least], strong, views, names, associated
+        [part for part in parts if part.score >= least],
+        strong,
+        joint.views,
+        joint.names,
+        associated,
     )
     weaker = [part for part in parts if part not in passed]
+    return views_result(estimator, joint, passed, findings, weaker, before)
+
+
+def views_result(
+    estimator: PoseEstimator,
+    joint: JointEstimator,
+    parts: Sequence[WorldDetection],
+    findings: Sequence[str],
+    weaker: Sequence[WorldDetection],
+    before: Mapping[str, float],
+    identities: Sequence[int] | None = None,
+    velocities: Sequence[Step] | None = None,
+) -> ViewsResult:
+    """Return parts with the views that show them; see :class:`ViewsResult`.
+
+    ``before`` is ``estimator.spent_ms`` before the images. Each view has an equal share of the
+    time.
+    """
+    assert estimator.refiner is not None
     shapes = {
-        part.name: Shape(part.diameter, refiner.mesh(part.name)) for part in estimator.solid_parts
+        part.name: Shape(part.diameter, estimator.refiner.mesh(part.name))
+        for part in estimator.solid_parts
     }
+    elapsed = elapsed_by_step(before, estimator.spent_ms)
+    speed = {step: ms / len(joint.views) for step, ms in elapsed.items()}
     results = []
-    for number, (view, speed) in enumerate(zip(views, speeds, strict=True)):
-        evidence = [part.evidence[number] for part in passed]
-        shown = [item.detection for item in evidence if item.status == "supports"]
-        result = PoseResult(view.image, view.K, shown, speed, names[number], number, shapes=shapes)
-        results.append(result)
-    return ViewsResult(passed, findings, results, weaker)
+    for number, (view, name) in enumerate(zip(joint.views, joint.names, strict=True)):
+        shown = [n for n, part in enumerate(parts) if part.evidence[number].status == "supports"]
+        detections = [parts[n].evidence[number].detection for n in shown]
+        numbers = None if identities is None else [identities[n] for n in shown]
+        given = view.image, view.K, detections, speed, name, number, None, numbers, shapes
+        results.append(PoseResult(*given))
+    return ViewsResult(parts, findings, results, weaker, identities, velocities)
 
 
 def _posed_images(
@@ -125,14 +184,18 @@ def _posed_images(
     return views
 
 
-def _search(
-    estimator: PoseEstimator, views: Sequence[PosedImage], distances: Distances | None
-) -> tuple[list[list[PartObservation]], list[dict[str, float]]]:
-    """Detect parts in each view alone; return observations and milliseconds per step by view."""
-    observations, speeds = [], []
+def _observations(
+    estimator: PoseEstimator,
+    views: Sequence[PosedImage],
+    distances: Distances | None,
+    regions: Sequence[Region | None] | None,
+) -> list[list[PartObservation]]:
+    """Detect parts in each view alone; see :func:`search`."""
+    observations: list[list[PartObservation]] = []
     for number, view in enumerate(views):
-        before = dict(estimator.spent_ms)
-        candidates = estimator.candidates(view.image, view.K, None, view.depth, distances)
+        region = None if regions is None else regions[number]
+        given = view.image, view.K, None, view.depth, distances, region
+        is_searched = regions is None or region is not None
+        candidates = estimator.candidates(*given) if is_searched else []
         observations.append([make_observation(number, candidate, view) for candidate in candidates])
-        speeds.append(elapsed_by_step(before, estimator.spent_ms))
-    return observations, speeds
+    return observations

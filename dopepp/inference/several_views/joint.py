@@ -8,7 +8,7 @@ best single view.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -17,13 +17,17 @@ import numpy as np
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.network_input import are_same
-from dopepp.inference.refinement.joint_refinement import PosedImage
+from dopepp.inference.refinement.joint_refinement import (
+    JointRefinement,
+    PosedImage,
+    rotate_covariance,
+)
 from dopepp.inference.refinement.refiner import LOOSER, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
-from dopepp.inference.refinement.solver import Prior, UndecidedError
+from dopepp.inference.refinement.solver import PoseMatrix, Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
-from dopepp.recovery.detection import log_odds
+from dopepp.recovery.detection import Detection, log_odds
 
 SUPPORTING: Final = 0.2
 """Smallest probability at which a view supports a pose."""
@@ -45,6 +49,9 @@ AGAINST: Final = -1.5
 COINCIDENCE: Final = 1.5
 """Log odds added by each further view that detects the part at the same pose, or whose outline
 agrees: wrong poses rarely fit two views."""
+
+REGULAR: Final = 1e-3
+"""Share of a forecast's information that keeps the information of the views invertible."""
 
 USUAL_MOVE: Final = 1.0
 """Assumed Mahalanobis distance between start and refined pose, a feature of the verification."""
@@ -77,8 +84,8 @@ class JointEstimator:
         geometries: Mapping[str, PartGeometry],
         slope: float,
     ) -> None:
-        self._refiner, self._views, self._names = refiner, views, names
-        self._geometries, self._slope = geometries, slope
+        self._refiner, self.views, self.names = refiner, views, names
+        self.geometries, self._slope = geometries, slope
 
     def parts(self, clusters: Sequence[Sequence[PartObservation]]) -> list[JointPart]:
         """Estimate one part per cluster of observations, drop duplicates, and sort by score.
@@ -108,8 +115,8 @@ class JointEstimator:
             The part with the observations that agree with the joint pose. If no two views agree,
             the pose is that of the best observation.
         """
-        name, all_views = observations[0].detection.object, set(range(len(self._views)))
-        geometry = self._geometries[name]
+        name, all_views = observations[0].detection.object, set(range(len(self.views)))
+        geometry = self.geometries[name]
         # Refine on the selected views, select the views that support the result, and repeat.
         selected, tried = all_views, list[tuple[set[int], int]]()
         while len(selected) > 1 and (selected, len(observations)) not in tried:
@@ -121,7 +128,7 @@ class JointEstimator:
             starts = [item.start for item in observations if item.view in selected]
             prior = geometry.mean(starts or [observations[0].start])
             try:
-                views = [self._views[number] for number in numbers]
+                views = [self.views[number] for number in numbers]
                 joint = self._refiner.refine_views(name, views, search_range, prior)
             except UndecidedError:
                 break
@@ -159,10 +166,97 @@ class JointEstimator:
         evidence = [
             self._evidence(number, best.pose, [best], None)
             if number != best.view
-            else ViewEvidence(self._names[number], "supports", probability, detection)
+            else ViewEvidence(self.names[number], "supports", probability, detection)
             for number in all_views
         ]
         return self._part([best], best.pose, evidence)
+
+    def follow(
+        self, part: WorldDetection, forecast: Prior
+    ) -> tuple[WorldDetection, PoseMatrix] | None:
+        """Refine a tracked part on all views that show it, without a search in single views.
+
+        Views whose outline agrees less than :data:`AGREEING` are excluded, e.g. if the part is
+        occluded there. The part keeps its score and its probabilities.
+
+        Args:
+            part: The part in the previous images, with evidence of the same views.
+            forecast: Predicted pose in the world, with its uncertainty.
+
+        Returns:
+            The part, and its covariance without the lasting errors of the camera poses, from which
+            a filter continues. None if no view shows the part.
+        """
+        shown = dict[int, OutlineAgreement | None]()
+        supporting = set(range(len(self.views)))
+        selected: set[int] = set()
+        while supporting and supporting != selected:
+            selected = supporting
+            try:
+                views = [self.views[number] for number in sorted(selected)]
+                joint = self._refiner.refine_views(part.object, views, forecast, forecast, True)
+            except UndecidedError:
+                return None
+            shown |= dict(zip(sorted(selected), joint.agreements, strict=True))
+            supporting = {n for n in selected if (item := shown[n]) and item.share >= AGREEING}
+        if not supporting:
+            return None
+        covariance = joint.covariance * max(1.0, *joint.disagreements) ** 2
+        lasting = covariance + _lasting_error(joint, views, forecast)
+        pose = Prior(joint.T_world_obj, np.linalg.inv(lasting))
+        moved = self.moved(part, pose, shown, supporting, max(joint.disagreements))
+        return moved, covariance
+
+    def moved(
+        self,
+        part: WorldDetection,
+        pose: Prior,
+        agreements: Mapping[int, OutlineAgreement | None],
+        supporting: Set[int],
+        disagreement: float,
+    ) -> WorldDetection:
+        """Return a part at another pose.
+
+        Args:
+            part: The part, with evidence of the same views.
+            pose: New pose in the world.
+            agreements: Agreement of the outline at the new pose, by index of the view.
+            supporting: Indices of the views that show the part.
+            disagreement: See :class:`WorldDetection`.
+        """
+        evidence = []
+        for number, item in enumerate(part.evidence):
+            detection = self._in_view(number, pose, item.detection, agreements.get(number))
+            status = "supports" if number in supporting else self._unsupported(number, detection)
+            evidence.append(replace(item, status=status, detection=detection))
+        return replace(
+            part,
+            T_world_obj=pose.T_cam_obj,
+            covariance=np.linalg.inv(pose.information),
+            evidence=evidence,
+            disagreement=disagreement,
+        )
+
+    def _in_view(
+        self, number: int, pose: Prior, detection: Detection, agreement: OutlineAgreement | None
+    ) -> Detection:
+        """Return a detection in the camera of a view, at a pose in the world."""
+        view = self.views[number]
+        distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
+        T_cam_obj, cuboid = distribution.T_cam_obj, self.geometries[detection.object].cuboid
+        return replace(
+            detection,
+            T_cam_obj=T_cam_obj,
+            keypoints=project_keypoints(cuboid, T_cam_obj, view.K),
+            covariance=np.linalg.inv(distribution.information),
+            agreement=None if agreement is None else agreement.share,
+            support=None if agreement is None else agreement.support,
+        )
+
+    def _unsupported(self, number: int, detection: Detection) -> Status:
+        """Return why a view does not support a pose: it is outside the image, or hidden."""
+        centre, size = detection.keypoints[CENTROID], self.views[number].image.shape[1::-1]
+        return "hidden" if ((centre >= 0) & (centre < size)).all() else "outside"
 
     def _evidence(
         self,
@@ -172,20 +266,13 @@ class JointEstimator:
         agreement: OutlineAgreement | None,
     ) -> ViewEvidence:
         """Return the visibility and probability in one view of a part at a pose in the world."""
-        view = self._views[number]
+        view = self.views[number]
         observation = next((item for item in observations if item.view == number), None)
-        distribution = view.to_camera(pose.T_cam_obj, np.linalg.inv(pose.information))
         original = observations[0].detection if observation is None else observation.detection
-        geometry = self._geometries[original.object]
-        detection = replace(
-            original,
-            T_cam_obj=distribution.T_cam_obj,
-            keypoints=project_keypoints(geometry.cuboid, distribution.T_cam_obj, view.K),
-            peaks=np.full_like(original.peaks, np.nan) if observation is None else original.peaks,
-            covariance=np.linalg.inv(distribution.information),
-            agreement=None if agreement is None else agreement.share,
-            support=None if agreement is None else agreement.support,
-        )
+        geometry = self.geometries[original.object]
+        detection = self._in_view(number, pose, original, agreement)
+        if observation is None:
+            detection = replace(detection, peaks=np.full_like(original.peaks, np.nan))
         detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
@@ -196,11 +283,9 @@ class JointEstimator:
         is_shown = agreement is not None and probability >= least and share >= least_share
         if observation is not None and original.kept:
             is_shown |= geometry.separation(pose, observation.pose) <= CONSISTENT
-        status: Status = "supports" if is_shown else "hidden"
-        centre = detection.keypoints[CENTROID]
-        if not ((centre >= 0) & (centre < view.image.shape[1::-1])).all():
-            status = "outside"
-        return ViewEvidence(self._names[number], status, probability, detection)
+        status = self._unsupported(number, detection)
+        status = "supports" if is_shown and status == "hidden" else status
+        return ViewEvidence(self.names[number], status, probability, detection)
 
     def _part(
         self,
@@ -230,6 +315,23 @@ class JointEstimator:
         covariance = np.linalg.inv(pose.information)
         given = best.object, score, _probability(odds), pose.T_cam_obj, covariance
         return JointPart(observations, WorldDetection(*given, evidence, disagreement))
+
+
+def _lasting_error(
+    joint: JointRefinement, views: Sequence[PosedImage], forecast: Prior
+) -> PoseMatrix:
+    """Return the covariance of a tracked pose due to the errors of the camera poses, world axes.
+
+    These errors are the same on all images, so a filter does not reduce them. If errors e of the
+    views with information W pull at the pose, the pose of a part at rest is (Σ W)⁻¹ Σ W e.
+    """
+    total, pulled = REGULAR * forecast.information, np.zeros((6, 6))
+    for view, W in zip(views, joint.informations, strict=True):
+        error = view.error_at(view.pose(joint.T_world_obj)[:3, 3])
+        total = total + W
+        pulled += W @ rotate_covariance(view.T_cam_world[:3, :3].T, error) @ W
+    gain = np.linalg.inv(total)
+    return np.asarray(gain @ pulled @ gain.T)
 
 
 def _is_duplicate(part: JointPart, better: JointPart) -> bool:

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import cv2
 import numpy as np
 
-from dopepp.geometry.camera import Transform
+from dopepp.drawing.pictures import RGBImage
+from dopepp.geometry.camera import Step, Transform
 from dopepp.inference.pose_result import PoseResult
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
 from dopepp.recovery.detection import Detection
@@ -56,6 +58,12 @@ class WorldDetection:
         return Prior(self.T_world_obj, np.linalg.inv(self.covariance))
 
     @property
+    def agreement(self) -> float:
+        """Mean agreement of the outline in the views that show the part; 0 if none does."""
+        shown = [item.detection for item in self.evidence if item.status == "supports"]
+        return float(np.mean([item.agreement or 0.0 for item in shown])) if shown else 0.0
+
+    @property
     def views(self) -> list[str]:
         """Names of the views that show the part."""
         return [item.view for item in self.evidence if item.status == "supports"]
@@ -85,11 +93,19 @@ class WorldDetection:
 class ViewsResult:
     """Parts detected in several views of a static scene."""
 
-    detections: Sequence[WorldDetection]  # best score first
+    detections: Sequence[WorldDetection]  # best score first; from a tracker, sorted by identity
     findings: Sequence[str]  # contradictions between the views, and how to resolve them
     views: Sequence[PoseResult]  # result of each view, with the detections that it supports
     # Detections below the threshold or rejected by a contradiction, best score first
     weaker: Sequence[WorldDetection] = ()
+    identities: Sequence[int] | None = None  # tracked instances; None without a tracker
+    # Motion of each tracked part per set of images, in world axes; see Track
+    velocities: Sequence[Step] | None = None
+
+    @property
+    def num_weaker(self) -> int:
+        """Number of weaker detections."""
+        return len(self.weaker)
 
     @property
     def summary(self) -> str:
@@ -98,9 +114,21 @@ class ViewsResult:
         shown = ", ".join(f"{share} of {len(self.views)} views" for share in shares)
         return f"{count} part{'s' * (count > 1)}: {shown}" if count else "nothing found"
 
+    def plot(self) -> RGBImage:
+        """Return the drawn images of all views side by side, each as high as the first."""
+        images = [view.plot() for view in self.views]
+        height = images[0].shape[0]
+        sizes = [(round(image.shape[1] * height / image.shape[0]), height) for image in images]
+        resized = [cv2.resize(image, size) for image, size in zip(images, sizes, strict=True)]
+        return np.ascontiguousarray(np.hstack(resized))
+
     def records(self) -> list[dict[str, Any]]:
-        """Return each detection as a dictionary for JSON."""
-        return [detection.to_record() for detection in self.detections]
+        """Return each detection as a dictionary for JSON, with its identity if it is tracked."""
+        records = [detection.to_record() for detection in self.detections]
+        if self.identities is None:
+            return records
+        pairs = zip(self.identities, records, strict=True)
+        return [{"identity": identity, **record} for identity, record in pairs]
 
     def to_json(self) -> str:
         """Return image names, contradictions ("findings") and detections as one line of JSON."""

@@ -1,7 +1,8 @@
 """ROS messages of a node, as dicts that need no installed ROS.
 
-Poses are in the camera's optical frame, which has OpenCV's axes, in metres. Quaternions are
-(x, y, z, w); covariances have translation before rotation. Topics are named as in DOPE.
+Poses are in the camera's optical frame, which has OpenCV's axes, or in the world frame of several
+cameras, in metres. Quaternions are (x, y, z, w); covariances have translation before rotation.
+Topics are named as in DOPE.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.pose_result import COLOURS
+from dopepp.inference.several_views.views_result import WorldDetection
 from dopepp.parts.mesh import face_areas
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import Detection
-from dopepp.robot.nodes.worker import Answer, Stamp
+from dopepp.robot.nodes.worker import Answer, Posed, Stamp
 
 MARKER_FACES: Final = 1000  # largest number of triangles of a marker; its message has 36 kB
 
@@ -109,9 +110,9 @@ class AnswerFormatter:
         header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
         makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
-            copies = [pose for pose in answer.result.detections if pose.object == name]
+            copies = [pose for pose in answer.detections if pose.object == name]
             copies.sort(key=lambda detection: -detection.score)
-            poses = [_pose(detection.T_cam_obj) for detection in copies]
+            poses = [_pose(_transform(detection)) for detection in copies]
             if poses:
                 makers[f"pose_{word}"] = partial(dict, header=header, pose=poses[0])
             makers[f"poses_{word}"] = partial(dict, header=header, poses=poses)
@@ -127,18 +128,18 @@ class AnswerFormatter:
             if topic in makers and is_wanted(topic)
         ]
 
-    def _frames(self, answer: Answer) -> list[tuple[str, Detection]]:
+    def _frames(self, answer: Answer) -> list[tuple[str, Posed]]:
         """Return (TF frame name, detection) pairs; the name is ``<object>_<n>``."""
         return [
             (f"{self._names[detection.object]}_{number}", detection)
-            for number, detection in zip(answer.numbers, answer.result.detections, strict=True)
+            for number, detection in zip(answer.numbers, answer.detections, strict=True)
         ]
 
     def _detections(self, answer: Answer, header: Fields) -> Fields:
         """Return ``vision_msgs/Detection3DArray`` fields, with the parts' cuboids as boxes."""
         detections = []
         for name, detection in self._frames(answer):
-            cuboid, centre = self._cuboids[detection.object], detection.T_cam_obj.copy()
+            cuboid, centre = self._cuboids[detection.object], _transform(detection).copy()
             centre[:3, 3] += centre[:3, :3] @ cuboid[-1]  # the box centre, not the part's origin
             box = {"center": _pose(centre), "size": _xyz(np.ptp(cuboid, axis=0))}
             results = [_hypothesis(detection)]
@@ -149,7 +150,7 @@ class AnswerFormatter:
         """Return the fields of ``tf2_msgs/TFMessage``."""
         transforms = []
         for name, detection in self._frames(answer):
-            pose = _pose(detection.T_cam_obj)
+            pose = _pose(_transform(detection))
             transform = {"translation": pose["position"], "rotation": pose["orientation"]}
             transforms.append({"header": header, "child_frame_id": name, "transform": transform})
         return {"transforms": transforms}
@@ -157,7 +158,7 @@ class AnswerFormatter:
     def _markers(self, answer: Answer, header: Fields) -> Fields:
         """Return ``visualization_msgs/MarkerArray`` fields; delete the last image's markers."""
         markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
-        for index, detection in enumerate(answer.result.detections):
+        for index, detection in enumerate(answer.detections):
             red, green, blue = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
             marker = {
                 "header": header,
@@ -165,7 +166,7 @@ class AnswerFormatter:
                 "id": index,
                 "type": TRIANGLE_LIST,
                 "action": ADD,
-                "pose": _pose(detection.T_cam_obj),
+                "pose": _pose(_transform(detection)),
                 "scale": _xyz(np.ones(3)),
                 "color": {"r": red, "g": green, "b": blue, "a": 0.8},
                 "points": self._triangles[detection.object],
@@ -195,13 +196,20 @@ def image_fields(image: RGBImage, header: Fields) -> Fields:
     return {"header": header, **size, **layout, "data": image.tobytes()}
 
 
-def _hypothesis(detection: Detection) -> Fields:
+def _transform(detection: Posed) -> Transform:
+    """Return the pose of a detection in the frame of the answer."""
+    if isinstance(detection, WorldDetection):
+        return detection.T_world_obj
+    return detection.T_cam_obj
+
+
+def _hypothesis(detection: Posed) -> Fields:
     """Return ``vision_msgs/ObjectHypothesisWithPose`` fields, with ROS's order of covariances."""
     order = [3, 4, 5, 0, 1, 2]
     covariance = detection.covariance[np.ix_(order, order)]
     return {
         "hypothesis": {"class_id": detection.object, "score": float(detection.score)},
-        "pose": {"pose": _pose(detection.T_cam_obj), "covariance": covariance.ravel().tolist()},
+        "pose": {"pose": _pose(_transform(detection)), "covariance": covariance.ravel().tolist()},
     }
 
 

@@ -1,5 +1,6 @@
 """A ROS 2 node, with the wheels of the package extra ``ros2`` or the rclpy of an installed ROS.
 
+The images of several cameras are paired by their stamps (:mod:`.pairing`) into sets.
 The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
 The queue is short. A camera is faster than a network, so the latest image waits in a
 :class:`Slot` while its predecessor is processed. Topics whose message types are not installed
@@ -13,10 +14,10 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
-from functools import cache
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
@@ -24,6 +25,8 @@ from typing import Any, Final, Generic, TypeVar
 import numpy as np
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera import Transform
+from dopepp.geometry.transform_file import parse_transform
 from dopepp.inference.frames.ros import info_topic
 from dopepp.robot.nodes.messages import (
     DIAGNOSTICS,
@@ -34,12 +37,16 @@ from dopepp.robot.nodes.messages import (
     Triangles,
     diagnosis,
 )
-from dopepp.robot.nodes.worker import Stamp, Worker
+from dopepp.robot.nodes.pairing import MAX_LAG_S, StampPairing
+from dopepp.robot.nodes.views_worker import ViewsWorker
+from dopepp.robot.nodes.worker import Shot, Stamp, Worker, stamp_of
 
 QUEUE_IN: Final = 5  # a shorter queue loses images on a busy machine; a longer one delays them
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
 PATIENCE_S: Final = 5.0  # seconds to wait for the last image when the node stops
+SILENT_S: Final = 5  # seconds without an image before a warning
+UNPAIRED: Final = 10  # consecutive dropped sets before a warning
 CHECKPOINTS: Final = -1.0  # parameter ``confidence`` that selects the checkpoint's threshold
 RECENT: Final = 100  # number of images over which rates and latencies are reported
 
@@ -48,14 +55,21 @@ logger = logging.getLogger(__name__)
 Item = TypeVar("Item")
 
 
-def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> None:
-    """Publish the poses in the images of a ROS 2 topic until the process is interrupted.
+def run(
+    worker: Worker,
+    topics: Sequence[str],
+    name: str,
+    params: Path | None = None,
+    max_lag_s: float = MAX_LAG_S,
+) -> None:
+    """Publish the poses in the images of ROS 2 topics until the process is interrupted.
 
     Args:
-        worker: Estimator of the poses.
-        topic: Topic of the images.
+        worker: Estimator of the poses; a :class:`ViewsWorker` for several topics.
+        topics: Topic of each camera's images.
         name: Name of the node, which prefixes its topics.
         params: YAML file of ROS 2 parameters.
+        max_lag_s: Largest difference of the stamps in a set of images, seconds.
 
     Raises:
         UserError: A name, the file or a parameter in it is invalid.
@@ -72,10 +86,10 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
-        node = _Node(worker, topic, name)
+        node = _Node(worker, topics, name, max_lag_s)
         executor = SingleThreadedExecutor()
         executor.add_node(node.handle)
-        logger.info("%s: images of %s, poses on /%s/…", name, topic, name)
+        logger.info("%s: images of %s, poses on /%s/…", name, " and ".join(topics), name)
         while True:
             executor.spin_once(timeout_sec=WAIT_S)
     finally:
@@ -84,15 +98,45 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
         rclpy.try_shutdown()
 
 
+@dataclass(eq=False)
+class _Camera:
+    """Subscription to a camera's images, and its state."""
+
+    topic: str
+    subscriptions: Sequence[Any] = ()
+    info: Any | None = None  # latest ``camera_info``
+    is_reliable: bool = True
+    received: int = 0
+    received_before: int = 0  # number of images at the last check
+    silent_s: int = 0  # seconds without an image
+
+    @property
+    def problem(self) -> str:
+        """Why the camera has no images, or an empty string."""
+        silence = f" for {self.silent_s} s" if self.received else ""
+        is_silent = not self.received or self.silent_s >= SILENT_S
+        return f"no image on {self.topic}{silence}" if is_silent else ""
+
+
 class _Node:
     """ROS 2 node that subscribes to images and publishes the worker's poses in them."""
 
-    def __init__(self, worker: Worker, topic: str, name: str) -> None:
+    def __init__(
+        self,
+        worker: Worker,
+        topics: Sequence[str],
+        name: str,
+        max_lag_s: float = MAX_LAG_S,
+    ) -> None:
         import rclpy
 
-        with _ros_errors(f"--name {name}, --topic {topic}"):
+        with _ros_errors(f"--name {name}, --topic {' --topic '.join(topics)}"):
             self.handle = rclpy.create_node(name)
-            self._topic = self.handle.resolve_topic_name(topic)
+            self._cameras = [_Camera(self.handle.resolve_topic_name(topic)) for topic in topics]
+        if isinstance(worker, ViewsWorker) and worker.poses is None:
+            worker.look_up = transform_lookup(self.handle, worker.world)
+        several = len(topics) > 1
+        self._pairing = StampPairing[Shot](len(topics), max_lag_s) if several else None
         self._worker, self._name = worker, name
         self._declare_parameters()
         self._clock = self.handle.get_clock()
@@ -100,12 +144,10 @@ class _Node:
         self._publishers: dict[str, Any] = {}
         for published, kind in (*self._formatter.topics(), DIAGNOSTICS):
             self._advertise(published, kind)
-        self.slot: Slot[tuple[Any, Any | None]] = Slot(self._answer)
-        self._info: Any | None = None
-        self._is_reliable = True
-        self._subscriptions: list[Any] = []
-        self._subscribe()
-        self._silent_s, self._summary = 0, ""
+        self.slot: Slot[Sequence[Shot]] = Slot(self._answer)
+        for number in range(len(topics)):
+            self._subscribe(number)
+        self._summary, self._has_warned = "", False
         self.handle.create_timer(1.0, self._tick)
 
     def _declare_parameters(self) -> None:
@@ -146,33 +188,45 @@ class _Node:
             return
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
-    def _subscribe(self) -> None:
-        """Replace the subscriptions to the images and their ``camera_info``."""
+    def _subscribe(self, number: int) -> None:
+        """Replace the subscriptions to a camera's images and their ``camera_info``."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-        policy = ReliabilityPolicy.RELIABLE if self._is_reliable else ReliabilityPolicy.BEST_EFFORT
-        compressed = self._topic.endswith("/compressed")
+        camera = self._cameras[number]
+        policy = ReliabilityPolicy.RELIABLE if camera.is_reliable else ReliabilityPolicy.BEST_EFFORT
+        compressed = camera.topic.endswith("/compressed")
         image = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
         info = type_of("sensor_msgs/CameraInfo")
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
-        for subscription in self._subscriptions:
+        for subscription in camera.subscriptions:
             self.handle.destroy_subscription(subscription)
         # This order delivers the camera_info before its image.
-        self._subscriptions = [
-            self.handle.create_subscription(info, info_topic(self._topic), self._take_info, qos),
-            self.handle.create_subscription(image, self._topic, self._take_image, qos),
+        handlers = {
+            info_topic(camera.topic): (info, partial(self._take_info, number)),
+            camera.topic: (image, partial(self._take_image, number)),
+        }
+        camera.subscriptions = [
+            self.handle.create_subscription(kind, topic, handler, qos)
+            for topic, (kind, handler) in handlers.items()
         ]
 
-    def _take_info(self, message: Any) -> None:
-        self._info = message
+    def _take_info(self, number: int, message: Any) -> None:
+        self._cameras[number].info = message
 
-    def _take_image(self, message: Any) -> None:
-        """Pass an image and the latest ``camera_info`` to the worker's thread."""
-        self.slot.put((message, self._info))
+    def _take_image(self, number: int, message: Any) -> None:
+        """Pass an image, or the set that it completes, to the worker's thread."""
+        camera = self._cameras[number]
+        camera.received += 1
+        shot = Shot(message, camera.info, camera.topic)
+        shots: Sequence[Shot] | None = [shot]
+        if self._pairing is not None:
+            shots = self._pairing.add(number, stamp_of(message.header.stamp).seconds, shot)
+        if shots is not None:
+            self.slot.put(shots)
 
-    def _answer(self, item: tuple[Any, Any | None]) -> None:
-        """Publish the poses in an image; runs in the worker's thread."""
-        answer = self._worker.process(*item, self._topic)
+    def _answer(self, shots: Sequence[Shot]) -> None:
+        """Publish the poses in an image or a set; runs in the worker's thread."""
+        answer = self._worker.process(*shots)
         if answer is None:
             return
         for message in self._formatter.messages(answer, self._is_wanted):
@@ -181,41 +235,69 @@ class _Node:
         self._summary = answer.result.summary
 
     def _tick(self) -> None:
-        """Publish the diagnostics, once a second; without images, try best effort, then warn."""
+        """Publish the diagnostics, once a second, and check each camera."""
         self._publish(self._diagnosis())
-        if self.slot.received:
-            return
-        self._silent_s += 1
-        if self._is_reliable and self._is_best_effort():
-            self._is_reliable = False
-            logger.warning("%s is published best effort: images may be lost", self._topic)
-            self._subscribe()
-        elif self._silent_s == 5:
+        for number in range(len(self._cameras)):
+            self._check_silence(number)
+        if self._pairing_problem() and not self._has_warned:
+            self._has_warned = True
+            logger.warning("%s", self._pairing_problem())
+
+    def _check_silence(self, number: int) -> None:
+        """If a camera has no new images, try best effort once, then warn."""
+        camera = self._cameras[number]
+        is_silent = camera.received == camera.received_before
+        camera.received_before = camera.received
+        camera.silent_s = camera.silent_s + 1 if is_silent else 0
+        if not camera.received and camera.is_reliable and self._is_best_effort(camera.topic):
+            camera.is_reliable = False
+            logger.warning("%s is published best effort: images may be lost", camera.topic)
+            self._subscribe(number)
+        elif camera.silent_s == SILENT_S:
             overlay, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
             topics = self.handle.get_topic_names_and_types()
             names = [name for name, kinds in topics if kind in kinds and name != overlay]
             others = ", ".join(names) or "none"
-            text = "no image on %s for 5 s; topics with images: %s (--topic)"
-            logger.warning(text, self._topic, others)
+            text = "no image on %s for %d s; topics with images: %s (--topic)"
+            logger.warning(text, camera.topic, SILENT_S, others)
+
+    def _pairing_problem(self) -> str:
+        """Return why the cameras' images form no sets, or an empty string."""
+        pairing = self._pairing
+        if pairing is None or pairing.dropped_in_a_row < UNPAIRED:
+            return ""
+        topics = " and ".join(camera.topic for camera in self._cameras)
+        lag, limit = 1e3 * (pairing.lag_s or 0.0), 1e3 * pairing.max_lag_s
+        return (
+            f"stamps on {topics} differ by {lag:.1f} ms, and --lag allows {limit:.1f} ms: trigger "
+            "the cameras together, synchronise their clocks, or raise --lag"
+        )
 
     def _diagnosis(self) -> Message:
         """Return the diagnostic message: image counts, rate, latency and the current problem."""
         self.slot.check()
-        counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
+        received = sum(camera.received for camera in self._cameras)
+        counts = {"received": received, "replaced by newer": self.slot.replaced}
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
+        if (pairing := self._pairing) is not None:
+            values |= {
+                f"received on {camera.topic}": str(camera.received) for camera in self._cameras
+            }
+            values |= {"sets": str(pairing.num_sets), "dropped sets": str(pairing.dropped)}
+            values["lag (ms)"] = "" if pairing.lag_s is None else f"{1e3 * pairing.lag_s:.1f}"
         values["last image"] = self._summary
         now = self._now()
         stamp = Stamp(int(now), int(1e9 * (now % 1)))
-        problem = self._worker.problem
-        if not self.slot.received:
-            problem = problem or f"no image on {self._topic}"
+        silences = [camera.problem for camera in self._cameras]
+        problems = [self._worker.problem, *silences, self._pairing_problem()]
+        problem = next((text for text in problems if text), "")
         return diagnosis(stamp, self._name, problem, values)
 
-    def _is_best_effort(self) -> bool:
-        """Return whether a publisher of the image topic offers best-effort delivery only."""
+    def _is_best_effort(self, topic: str) -> bool:
+        """Return whether a publisher of an image topic offers best-effort delivery only."""
         from rclpy.qos import ReliabilityPolicy
 
-        offers = self.handle.get_publishers_info_by_topic(self._topic)
+        offers = self.handle.get_publishers_info_by_topic(topic)
         best_effort = ReliabilityPolicy.BEST_EFFORT
         return any(offer.qos_profile.reliability == best_effort for offer in offers)
 
@@ -245,6 +327,46 @@ def _ros_errors(source: str) -> Iterator[None]:
         allowed = "a running ROS 2, and names and values that ROS 2 accepts"
         fix = f"correct {source} according to the message"
         raise UserError(f"{source}: {error!s:.300}", allowed, fix) from error
+
+
+def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]:
+    """Return a function that looks up the pose of a frame in the world in TF at a time.
+
+    Args:
+        node: Node of rclpy, which receives the transforms.
+        world: Name of the world frame.
+
+    Raises:
+        UserError: ``tf2_ros`` is not installed. The function raises it if TF has no transform.
+    """
+    try:
+        from tf2_ros import Buffer, TransformListener
+    except ImportError as error:
+        problem = "several topics without --views, and without the package tf2_ros"
+        fix = "pass --views rig.yaml, or use the rclpy of an installed ROS"
+        raise UserError(problem, "camera poses from a file or from TF", fix) from error
+    from rclpy.duration import Duration
+    from rclpy.time import Time
+
+    buffer = Buffer()
+    buffer.listener = TransformListener(buffer, node)  # keeps the subscriptions alive
+
+    def look_up(frame: str, stamp: Stamp) -> Transform:
+        time = Time(seconds=stamp.sec, nanoseconds=stamp.nanosec)
+        try:
+            answer = buffer.lookup_transform(world, frame, time, Duration(seconds=WAIT_S))
+        except Exception as error:  # TF raises many types
+            problem = f"no transform from {world} to {frame} ({error!s:.200})"
+            fix = "publish it, choose another --world, or pass --views rig.yaml"
+            raise UserError(problem, "the pose of each camera in TF", fix) from error
+        shift, rotation = answer.transform.translation, answer.transform.rotation
+        fields = {
+            "translation": {axis: getattr(shift, axis) for axis in "xyz"},
+            "rotation": {axis: getattr(rotation, axis) for axis in "xyzw"},
+        }
+        return parse_transform(fields, f"TF from {world} to {frame}")
+
+    return look_up
 
 
 class Slot(Generic[Item]):

@@ -22,7 +22,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.frames import FrameSource
 from dopepp.inference.frames.ros import Bag
 from dopepp.robot.nodes.messages import OVERLAY, VISION, AnswerFormatter, Fields, Triangles
-from dopepp.robot.nodes.worker import Answer, Stamp, Worker, stamp_of
+from dopepp.robot.nodes.worker import Answer, Shot, Stamp, Worker, stamp_of
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -131,7 +131,7 @@ def process_bag(
     bag = Bag(source, topic)
     with draft(target) as path, _Recorder(path, name, worker) as recorder:
         for seconds, message, info in bag.messages():
-            answer = worker.process(message, info, bag.topic)
+            answer = worker.process(Shot(message, info, bag.topic))
             if answer is not None:
                 stamp = stamp_of(message.header.stamp)
                 if stamp == Stamp(0, 0):

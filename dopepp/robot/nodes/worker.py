@@ -8,24 +8,29 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
 from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
 from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
+from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
 from dopepp.inference.tracker import PoseTracker
+from dopepp.recovery.detection import Detection
 
 PATIENCE: Final = 5  # number of consecutive images without ``camera_info`` before the warning
 
 OPTICAL: Final = "optical"  # part of the name of each frame whose z axis is forward (REP 103)
 
 logger = logging.getLogger(__name__)
+
+Posed = Detection | WorldDetection  # detection in the frame of a camera, or in the world
 
 
 class Stamp(NamedTuple):
@@ -60,8 +65,13 @@ class Answer:
     """Poses in an image, with the time and frame for ROS messages."""
 
     stamp: Stamp  # capture time of the image
-    frame_id: str  # name of the poses' reference frame: the camera's optical frame
-    result: PoseResult
+    frame_id: str  # reference frame: the camera's optical frame, or the world of several cameras
+    result: PoseResult | ViewsResult
+
+    @property
+    def detections(self) -> Sequence[Posed]:
+        """Detections in the reference frame."""
+        return self.result.detections
 
     @property
     def numbers(self) -> list[int]:
@@ -72,8 +82,27 @@ class Answer:
         """
         if self.result.identities is not None:
             return [*self.result.identities]
-        names = [detection.object for detection in self.result.detections]
+        names = [detection.object for detection in self.detections]
         return [names[:index].count(name) for index, name in enumerate(names)]
+
+
+class Shot(NamedTuple):
+    """Messages of an image."""
+
+    message: Any  # ``sensor_msgs/Image`` or ``CompressedImage``
+    info: Any | None  # ``sensor_msgs/CameraInfo``, if any
+    topic: str  # topic of the image
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """Content of an image's messages."""
+
+    frame: CameraFrame
+    camera: Camera
+    is_cropped: bool
+    stamp: Stamp
+    frame_id: str  # name of the camera's optical frame
 
 
 class Worker:
@@ -105,7 +134,7 @@ class Worker:
         self._tracker = PoseTracker(self._estimator(True)) if track else None
         self._warned: set[str] = set()
         self._last: Stamp | None = None
-        self._number = self._num_without_info = 0
+        self._number, self._num_without_info = 0, dict[str, int]()
         self._shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
         self.problem = ""
         """Why the last image could not be processed, or an empty string."""
@@ -133,50 +162,69 @@ class Worker:
             self._estimators[refine] = base.refining(term, base.solid_parts)
         return self._estimators[refine]
 
-    def process(self, message: Any, info: Any | None, topic: str) -> Answer | None:
+    def process(self, *shots: Shot) -> Answer | None:
         """Estimate the poses in the image of a ROS message.
 
         Args:
-            message: ``sensor_msgs/Image`` or ``CompressedImage``.
-            info: ``sensor_msgs/CameraInfo`` of the image, if any.
-            topic: Topic of the image.
+            shots: The only image.
 
         Returns:
             The poses, or None (after a warning) if the image cannot be processed.
         """
+        (shot,) = shots
+        decoded = self._decoded(shot, self._camera)
+        if decoded is None:
+            return None
+        self._check_time(decoded.stamp, shot.topic)
+        try:
+            result = self.result(decoded.frame, decoded.camera, decoded.is_cropped)
+        except ValueError as error:
+            self._reject("camera", str(error))
+            return None
+        return self._answer(decoded.stamp, decoded.frame_id, result)
+
+    def _answer(self, stamp: Stamp, frame_id: str, result: PoseResult | ViewsResult) -> Answer:
+        """Return an answer, and count it."""
+        self.problem = ""
+        self._number += 1
+        return Answer(stamp, frame_id, result)
+
+    def _decoded(self, shot: Shot, given: Camera | None) -> Decoded | None:
+        """Return an image with its camera, or None after a warning.
+
+        ``given`` is a camera that replaces the camera of ``camera_info``.
+        """
+        message, info, topic = shot
         try:
             image = decode_image(message)
         except Exception as error:  # a message of any sender may cause any error
             fix = "configure the driver to send rgb8, bgr8 or JPEG"
-            self._reject("image", f"an image of {topic}: {error!s:.300}; fix: {fix}")
+            self._reject(f"image {topic}", f"an image of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
             lens = None if info is None else CameraInfo.from_message(info)
         except Exception as error:
-            self._reject("info", f"the camera_info of {topic}: {error!s:.300}")
+            self._reject(f"info {topic}", f"the camera_info of {topic}: {error!s:.300}")
             return None
-        if lens is None and self._camera is None:
-            self._num_without_info += 1
-            if self._num_without_info == PATIENCE:
+        missing = self._num_without_info.pop(topic, 0) + 1
+        if lens is None and given is None:
+            self._num_without_info[topic] = missing
+            if missing == PATIENCE:
                 problem = f"images on {topic} without camera_info: let the driver publish it, or "
                 problem += "pass --camera camera.yaml (from `dopepp calibrate camera`)"
-                self._reject("no info", problem)
+                self._reject(f"no info {topic}", problem)
             return None
-        self._num_without_info = 0
         stamp = stamp_of(message.header.stamp)
         frame_id = self._checked_frame(message.header.frame_id, lens, topic)
-        self._check_time(stamp, topic)
         try:
-            camera = self._camera or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
-            is_cropped = self._camera is None and lens is not None and lens.roi is not None
-            frame = CameraFrame(image, topic, self._number, stamp.seconds)
-            result = self.result(frame, camera, is_cropped)
+            camera = given or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
+            check_size(camera, image)
         except ValueError as error:  # a wrong value (UserError), or fields of wrong lengths
             self._reject("camera", str(error))
             return None
-        self.problem = ""
-        self._number += 1
-        return Answer(stamp, frame_id, result)
+        is_cropped = given is None and lens is not None and lens.roi is not None
+        frame = CameraFrame(image, topic, self._number, stamp.seconds)
+        return Decoded(frame, camera, is_cropped, stamp, frame_id)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
         """Estimate the poses in an image with the current settings.
@@ -189,12 +237,7 @@ class Worker:
         Raises:
             UserError: The camera was calibrated for another image size.
         """
-        size = (frame.image.shape[1], frame.image.shape[0])
-        if camera.size is not None and camera.size != size:
-            sizes = f"{camera.size[0]}×{camera.size[1]}, and images of {size[0]}×{size[1]}"
-            fix = "let the driver publish the camera_info of these images, or calibrate the "
-            fix += "camera at this size"
-            raise UserError(f"{camera.source} of {sizes}", "a camera of the images' size", fix)
+        check_size(camera, frame.image)
         estimator = self._estimator(self.settings.refine).reporting(self.settings.confidence)
         before, start = dict(estimator.spent_ms), time.perf_counter()
         image = camera.undistorted(frame.image)
@@ -234,7 +277,7 @@ class Worker:
         if problem:
             images = f"images on {topic} are in frame {frame_id!r:.80}"
             fix = "name the camera's optical frame: --frame camera_optical_frame"
-            self._warn("frame", f"{images}, {problem}; {fix}")
+            self._warn(f"frame {topic}", f"{images}, {problem}; {fix}")
         return frame_id
 
     def _check_time(self, stamp: Stamp, topic: str) -> None:
@@ -250,8 +293,12 @@ class Worker:
                 f"stamps on {topic} went back by {decrease_s:.3f} s: a restarted recording or "
                 "simulation, or two cameras on one topic? Parts are detected again",
             )
-            if self._tracker is not None:
-                self._tracker = PoseTracker(self._estimator(True))
+            self._restart()
+
+    def _restart(self) -> None:
+        """Forget all tracked parts."""
+        if self._tracker is not None:
+            self._tracker = PoseTracker(self._estimator(True))
 
     def _reject(self, kind: str, problem: str) -> None:
         """Set :attr:`problem`, why the last image is not processed, and warn."""
@@ -263,6 +310,20 @@ class Worker:
         if kind not in self._warned:
             self._warned.add(kind)
             self._send_warning(text)
+
+
+def check_size(camera: Camera, image: RGBImage) -> None:
+    """Check that a camera was calibrated for the size of an image.
+
+    Raises:
+        UserError: It was calibrated for another size.
+    """
+    size = (image.shape[1], image.shape[0])
+    if camera.size is not None and camera.size != size:
+        sizes = f"{camera.size[0]}×{camera.size[1]}, and images of {size[0]}×{size[1]}"
+        fix = "let the driver publish the camera_info of these images, or calibrate the "
+        fix += "camera at this size"
+        raise UserError(f"{camera.source} of {sizes}", "a camera of the images' size", fix)
 
 
 def stamp_of(stamp: Any) -> Stamp:

@@ -50,6 +50,8 @@ def test_each_datagram_holds_a_line(run, camera, intrinsics):
         (("{images}", "--json", "--params", "p.yaml"), "--params with --json"),
         (("{images}", "--bag", "a.bag", "--out", "b.mcap"), "--bag with"),
         (("camera", "--ros2"), "--ros2 with"),
+        (("{images}", "--json", "--topic", "/a", "--topic", "/b"), "2 topics with --json"),
+        (("{images}", "--json", "--views", "rig.yaml"), "--views with one topic"),
     ],
 )
 def test_wrong_combinations_of_options_are_one_line(refused, camera, words, message):

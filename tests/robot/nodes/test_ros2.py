@@ -40,7 +40,7 @@ def test_parameters_change_while_the_node_runs(estimator, tmp_path):
     rclpy.init(args=["--ros-args", "--params-file", str(params)])
     try:
         worker = Worker(estimator)
-        node = _Node(worker, "/camera/image_raw", "dope_of_a_test")
+        node = _Node(worker, ["/camera/image_raw"], "dope_of_a_test")
         assert worker.settings == WorkerSettings(confidence=0.25)
         for value, is_accepted in ((0.75, True), (7.0, False)):
             (result,) = node.handle.set_parameters([Parameter("confidence", value=value)])
@@ -61,7 +61,7 @@ def test_images_of_a_best_effort_camera_arrive(estimator, camera, caplog):
 
     rclpy.init()
     try:
-        node = _Node(Worker(estimator), "/best", "dope_of_a_test")
+        node = _Node(Worker(estimator), ["/best"], "dope_of_a_test")
         driver = rclpy.create_node("camera")
         image = native("sensor_msgs/Image", image_fields(camera.images[0], {}))
         publisher = driver.create_publisher(type(image), "/best", qos_profile_sensor_data)

@@ -9,7 +9,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.nodes.worker import PATIENCE, Stamp, Worker, WorkerSettings
+from dopepp.robot.nodes.worker import PATIENCE, Shot, Stamp, Worker, WorkerSettings
 
 
 @pytest.fixture
@@ -30,9 +30,8 @@ def take(worker, camera, messages):
         number=0, second=1.0, frame=messages.frame, info=True, topic=messages.topic, **changes
     ):
         camera_info = messages.info(camera.K, (320, 240), **changes) if info else None
-        return worker.process(
-            messages.image(camera.images[number], second, frame), camera_info, topic
-        )
+        image = messages.image(camera.images[number], second, frame)
+        return worker.process(Shot(image, camera_info, topic))
 
     return take
 
@@ -85,7 +84,7 @@ def test_several_images_without_camera_info_are_one_warning(take, warnings):
 
 def test_a_given_camera_replaces_camera_info(estimator, camera, messages, warnings):
     worker = Worker(estimator, camera=Camera(None, camera.K, (), "--K"), warn=warnings.append)
-    answer = worker.process(messages.image(camera.images[0], 1), None, messages.topic)
+    answer = worker.process(Shot(messages.image(camera.images[0], 1), None, messages.topic))
     expected = estimator.predict(camera.images[0], camera.K)
     np.testing.assert_allclose(
         answer.result.detections[0].T_cam_obj, expected[0].T_cam_obj, atol=1e-9
@@ -126,7 +125,8 @@ def test_a_missing_stamp_and_unreadable_images_are_warnings(
     bad = messages.image(camera.images[0], 1)
     for change in ({"encoding": "16UC1"}, {"data": b"12"}, {"height": 10**9}):
         changed = SimpleNamespace(**vars(bad) | change)
-        assert worker.process(changed, messages.info(camera.K, (320, 240)), messages.topic) is None
+        info = messages.info(camera.K, (320, 240))
+        assert worker.process(Shot(changed, info, messages.topic)) is None
     assert len(warnings) == 2
     assert "without a stamp" in warnings[0]
     assert "16UC1" in warnings[1]
@@ -139,7 +139,7 @@ def test_binning_and_region_of_interest_change_the_camera(worker, estimator, cam
     K[:2, 2] += (40, 20)
     roi = SimpleNamespace(x_offset=40, y_offset=20, width=640, height=480)
     info = messages.info(K, (800, 600), d=[0.0] * 5, roi=roi, binning_x=2, binning_y=2)
-    answer = worker.process(messages.image(camera.images[0], 1), info, messages.topic)
+    answer = worker.process(Shot(messages.image(camera.images[0], 1), info, messages.topic))
     np.testing.assert_allclose(answer.result.K, camera.K, atol=1e-9)
     expected = estimator.predict(camera.images[0], camera.K)[0]
     np.testing.assert_allclose(answer.result.detections[0].T_cam_obj, expected.T_cam_obj, atol=1e-6)
@@ -167,7 +167,9 @@ def test_tracked_parts_keep_their_numbers(estimator, camera, messages, warnings)
     tracking = Worker(estimator, WorkerSettings(refine=True), track=True, warn=warnings.append)
     info = messages.info(camera.K, (320, 240), d=[0.0] * 5)
     numbers = [
-        tracking.process(messages.image(camera.images[0], second), info, messages.topic).numbers
+        tracking.process(
+            Shot(messages.image(camera.images[0], second), info, messages.topic)
+        ).numbers
         for second in (1, 2, 3)
     ]
     assert numbers == [[0]] * 3
