@@ -90,13 +90,14 @@ def choose_keypoints(
     is_open = allowed[:, :, 1:].any(dim=-1) & (batch.visible_fraction >= MIN_VISIBLE_FRACTION)
     index = is_open.nonzero()
     # As many maps as the batch has images at a time, for bounded memory.
-    for rows, slots in (part.unbind(-1) for part in index.split(len(batch))):
+    for rows, slots in (part.unbind(-1) for part in torch.split(index, len(batch))):
         outputs = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
-        map_size = outputs[0][0].shape[-2:]
+        height, width = outputs[0][0].shape[-2:]
         objects = batch.object_index[rows, slots, None]
         losses = []
         for choice in choices[rows, slots].unbind(1):
-            maps = encode(choice[:, None], objects, symmetry.num_objects, map_size, geometry)
+            given = choice[:, None], objects, symmetry.num_objects, (height, width), geometry
+            maps = encode(*given)
             losses.append(loss.per_image(outputs, *maps))
         best = torch.stack(losses, -1).where(allowed[rows, slots], torch.inf).argmin(-1)
         keypoints[rows, slots] = choices[rows, slots, best]
