@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, NoReturn
 
+import numpy as np
 import torch
 
 from dopepp.core.errors import UserError
@@ -38,7 +39,7 @@ from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import Detection, RecoveryOptions, log_odds, recalibrate
 from dopepp.recovery.recover import Reason
 
-NUM_REFINED: Final = 20  # number of start poses that are refined, those with the best outlines
+NUM_REFINED: Final = 20  # number of start poses of each part that are refined
 NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable
 REPEATS: Final = 2  # number of further refinements
 
@@ -156,8 +157,8 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         """Refine detections; the most probable results are refined again.
 
-        Of each part's start poses, only those whose outlines fit best after the coarse round are
-        refined. Start poses are so inaccurate that a single refinement may stop too early. Tracked
+        Of each part's start poses, only those with the best scores and those whose outlines fit
+        best after the coarse round are refined. Start poses are so inaccurate that a single refinement may stop too early. Tracked
         poses are refined only once, and so are all poses under a time limit.
         """
         if self.max_ms is not None or any(start.agreement is not None for start in detections):
@@ -165,7 +166,7 @@ class TemplateEstimator(PoseEstimator):
         ends: list[Detection] = []
         for detector in self.detectors:
             starts = [start for start in detections if start.object == detector.part.name]
-            best = self._best_fitting(starts, image, K)
+            best = self._most_promising(starts, image, K)
             poses = sorted(super().refined(best, image, K, depth), key=_probability, reverse=True)
             chosen = distinct_poses([pose.T_cam_obj for pose in poses], detector.part)
             ends += [
@@ -176,17 +177,22 @@ class TemplateEstimator(PoseEstimator):
             ]
         return ends
 
-    def _best_fitting(
+    def _most_promising(
         self, starts: list[Detection], image: RGBImage, K: CameraMatrix
     ) -> list[Detection]:
-        """Return the start poses whose outlines fit the image best after the coarse round."""
+        """Return the start poses with the best scores or outlines, both in equal numbers.
+
+        Scores rank poses in clutter better, outlines rank poses in plain surroundings better.
+        """
         if len(starts) <= NUM_REFINED:
             return starts
         assert self.refiner is not None  # templates are always refined
         with self._timed("refine"):
             fits = [self.refiner.coarse_fit(start, image, K) for start in starts]
-        order = sorted(range(len(starts)), key=lambda index: -fits[index])
-        return [starts[index] for index in order[:NUM_REFINED]]
+        by_score = np.argsort([-start.score for start in starts], kind="stable")
+        by_fit = np.argsort(-np.array(fits), kind="stable")
+        order = dict.fromkeys(np.column_stack([by_score, by_fit]).ravel().tolist())
+        return [starts[index] for index in list(order)[:NUM_REFINED]]
 
     def _refined_again(
         self,

@@ -61,7 +61,7 @@ OCTAVE: Final = 2.0  # largest ratio of the diameters that are ranked on the sam
 COARSE_SPREAD: Final = 5  # `spread` of the edges in the search, pixels
 FINE_SPREAD: Final = 3  # `spread` of the edges in the ranking, pixels
 
-NUM_RANKED: Final = 5000  # best matches that are ranked
+NUM_RANKED: Final = 16000  # best matches that are ranked
 NUM_TURNED: Final = 1000  # best matches of each octave that are compared with neighbouring views
 EXTENT: Final = 2.5  # added to the score per diameter of a view's extent, standard deviations
 NUM_STARTS: Final = 60  # start poses
