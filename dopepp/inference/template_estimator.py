@@ -158,8 +158,9 @@ class TemplateEstimator(PoseEstimator):
         """Refine detections; the most probable results are refined again.
 
         Of each part's start poses, only those with the best scores and those whose outlines fit
-        best after the coarse round are refined. Start poses are so inaccurate that a single refinement may stop too early. Tracked
-        poses are refined only once, and so are all poses under a time limit.
+        best after the coarse round are refined. Start poses are so inaccurate that a single
+        refinement may stop too early. Tracked poses are refined only once. Under a time limit, all
+        poses are refined once, until the time is spent.
         """
         if self.max_ms is not None or any(start.agreement is not None for start in detections):
             return super().refined(detections, image, K, depth)

@@ -299,20 +299,22 @@ def _concatenate(groups: Sequence[Matches]) -> Matches:
 
 
 def distinct_poses(
-    transforms: Sequence[Transform], part: Part, most: int | None = None
+    transforms: Sequence[Transform] | Float[np.ndarray, "poses 4 4"],
+    part: Part,
+    most: int | None = None,
 ) -> list[int]:
     """Return the indices of the first ``most`` poses that do not duplicate an earlier pose."""
-    transforms, centre = np.reshape(transforms, (-1, 4, 4)), part.cuboid[-1]
-    centres = transforms[:, :3, :3] @ centre + transforms[:, :3, 3]
-    free, chosen = np.ones(len(transforms), bool), []
-    for index in range(len(transforms)):
+    poses = np.reshape(transforms, (-1, 4, 4))
+    centres = poses[:, :3, :3] @ part.cuboid[-1] + poses[:, :3, 3]
+    free, chosen = np.ones(len(poses), bool), []
+    for index in range(len(poses)):
         if not free[index]:
             continue
         chosen.append(index)
         if len(chosen) == most:
             break
         distances = np.linalg.norm(centres[:, :2] - centres[index, :2], axis=1)
-        trace = np.einsum("nij,ij->n", transforms[:, :3, :3], transforms[index, :3, :3])
+        trace = np.einsum("nij,ij->n", poses[:, :3, :3], poses[index, :3, :3])
         free &= (
             (distances > SAME_PLACE * part.diameter)
             | (np.abs(centres[:, 2] / centres[index, 2] - 1) > SAME_DEPTH)
