@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, NoReturn
 
+import numpy as np
 import torch
 
 from dopepp.core.errors import UserError
@@ -29,7 +30,7 @@ from dopepp.inference.network_input import (
     merge_scales,
 )
 from dopepp.inference.refinement.refiner import Refine, refine_terms
-from dopepp.inference.templates import TemplateDetector
+from dopepp.inference.templates import TemplateDetector, distinct_poses
 from dopepp.inference.templates.background_level import background_log_odds
 from dopepp.inference.templates.ranking import learned_ranking
 from dopepp.parts.catalogue import load_part
@@ -38,7 +39,8 @@ from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import Detection, RecoveryOptions, log_odds, recalibrate
 from dopepp.recovery.recover import Reason
 
-NUM_REPEATED: Final = 10  # number of refined poses that are refined again, the most probable
+NUM_REFINED: Final = 20  # number of start poses of each part that are refined
+NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable
 REPEATS: Final = 2  # number of further refinements
 
 SCALE_ERROR: Final = 0.001
@@ -155,26 +157,60 @@ class TemplateEstimator(PoseEstimator):
     ) -> list[Detection]:
         """Refine detections; the most probable results are refined again.
 
-        Start poses are so inaccurate that a single refinement may stop too early. Tracked poses are
-        refined only once, and so are all poses under a time limit.
+        Of each part's start poses, only those with the best scores and those whose outlines fit
+        best after the coarse round are refined. Start poses are so inaccurate that a single
+        refinement may stop too early. Tracked poses are refined only once. Under a time limit, all
+        poses are refined once, until the time is spent.
         """
-        refined = super().refined(detections, image, K, depth)
-        if any(detection.agreement is not None for detection in detections):
-            return refined
+        if self.max_ms is not None or any(start.agreement is not None for start in detections):
+            return super().refined(detections, image, K, depth)
         ends: list[Detection] = []
         for detector in self.detectors:
-            poses = [end for end in refined if end.object == detector.part.name]
-            for _ in range(REPEATS if self.max_ms is None else 0):
-                poses.sort(key=_probability, reverse=True)
-                best = poses[:NUM_REPEATED]
-                starts = [detector.start(end.T_cam_obj, end.score, K) for end in best]
-                refined_again = super().refined(starts, image, K, depth)
-                poses[:NUM_REPEATED] = [
-                    new if new.kept == "" and _probability(new) > _probability(old) else old
-                    for new, old in zip(refined_again, best, strict=True)
-                ]
-            ends += poses
+            starts = [start for start in detections if start.object == detector.part.name]
+            best = self._most_promising(starts, image, K)
+            poses = sorted(super().refined(best, image, K, depth), key=_probability, reverse=True)
+            chosen = distinct_poses([pose.T_cam_obj for pose in poses], detector.part)
+            ends += [
+                self._refined_again(detector, poses[number], image, K, depth)
+                if rank < NUM_REPEATED
+                else poses[number]
+                for rank, number in enumerate(chosen)
+            ]
         return ends
+
+    def _most_promising(
+        self, starts: list[Detection], image: RGBImage, K: CameraMatrix
+    ) -> list[Detection]:
+        """Return the start poses with the best scores or outlines, both in equal numbers.
+
+        Scores rank poses in clutter better, outlines rank poses in plain surroundings better.
+        """
+        if len(starts) <= NUM_REFINED:
+            return starts
+        assert self.refiner is not None  # templates are always refined
+        with self._timed("refine"):
+            fits = [self.refiner.coarse_fit(start, image, K) for start in starts]
+        by_score = np.argsort([-start.score for start in starts], kind="stable")
+        by_fit = np.argsort(-np.array(fits), kind="stable")
+        order = dict.fromkeys(np.column_stack([by_score, by_fit]).ravel().tolist())
+        return [starts[index] for index in list(order)[:NUM_REFINED]]
+
+    def _refined_again(
+        self,
+        detector: TemplateDetector,
+        end: Detection,
+        image: RGBImage,
+        K: CameraMatrix,
+        depth: Depth | None,
+    ) -> Detection:
+        """Refine a pose again while its probability increases, at most ``REPEATS`` times."""
+        for _ in range(REPEATS):
+            start = detector.start(end.T_cam_obj, end.score, K)
+            (new,) = super().refined([start], image, K, depth)
+            if new.kept or _probability(new) <= _probability(end):
+                break
+            end = new
+        return end
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""

@@ -10,7 +10,8 @@ import pytest
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.geometry.rotation import rotation_angle
+from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.inference.template_estimator import NUM_REFINED
 from dopepp.inference.tracker import PoseTracker
 from dopepp.parts.catalogue import pivconnector
 from dopepp.recovery.recover import format_reasons
@@ -49,6 +50,27 @@ def test_starts_are_refined_verified_and_merged_by_instance(near_truth, estimato
     passed, weaker = estimator.reporting(0.0).split(estimator.candidates(image, K))
     assert passed[0].score == detection.score
     assert weaker == []
+
+
+def test_starts_with_the_best_outlines_are_refined_whatever_their_scores(estimator, rendered):
+    image, K, truth = rendered.image, rendered.scene.K, true_pose(rendered)
+    (detector,), rng = estimator.detectors, np.random.default_rng(5)
+    starts = []
+    for shift in rng.uniform(-0.03, 0.03, (NUM_REFINED + 10, 3)):
+        T = truth.copy()
+        T[:3, :3] = rotation_vector_to_matrix(rng.normal(size=3)) @ T[:3, :3]
+        T[:3, 3] += shift
+        starts.append(detector.start(T, 0.9, K))
+    T = truth.copy()
+    T[:3, :3] = rotation_vector_to_matrix(np.array([0.02, 0.02, 0])) @ T[:3, :3]
+    starts.append(detector.start(T, 0.1, K))
+    ends = estimator.refined(starts, image, K)
+    assert len(ends) <= NUM_REFINED
+    best = max(ends, key=lambda end: end.probability)
+    assert np.linalg.norm(best.T_cam_obj[:3, 3] - truth[:3, 3]) < 0.002
+    assert estimator.refiner.coarse_fit(starts[-1], image, K) > 0.8
+    T[:2, 3] += 1.0  # beside the image
+    assert estimator.refiner.coarse_fit(detector.start(T, 0.1, K), image, K) == 0.0
 
 
 def test_the_given_distances_replace_the_working_distance(estimator, rendered):

@@ -13,8 +13,24 @@ from dopepp.geometry.camera import camera_matrix, project, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.template_estimator import TemplateEstimator
-from dopepp.inference.templates import SMALLEST_PX, TemplateDetector, views
-from dopepp.inference.templates.matching import CELL, NUM_KEPT, NUM_ROLLS, STRIDE, match
+from dopepp.inference.templates import (
+    SAME_DEPTH,
+    SAME_PLACE,
+    SAME_TURN,
+    SMALLEST_PX,
+    TemplateDetector,
+    distinct_poses,
+    views,
+)
+from dopepp.inference.templates.matching import (
+    CELL,
+    NUM_KEPT,
+    NUM_ROLLS,
+    NUM_SUMMED,
+    QUANTUM,
+    STRIDE,
+    match,
+)
 from dopepp.inference.templates.responses import BINS, edge_responses
 from dopepp.inference.templates.views import (
     DRAWN_PX,
@@ -170,7 +186,8 @@ def test_cells_keep_the_matches_with_the_largest_sums_of_responses():
     rotations = np.tile(np.eye(3), (3, 1, 1))
     templates = Templates(rotations, points, normals, ones, points, ones[:, 0], links, links)
     rows, columns, pad = len(range(0, 46, STRIDE)), len(range(0, 57, STRIDE)), 40
-    padded = np.pad(responses, ((0, 0), (pad, pad), (pad, pad)))
+    quantised = np.floor(responses / QUANTUM + 0.5)
+    padded = np.pad(quantised, ((0, 0), (pad, pad), (pad, pad)))
     side, cells = round(CELL * size / STRIDE), {}
     for view, roll in np.ndindex(3, NUM_ROLLS):
         angle = 2 * np.pi * roll / NUM_ROLLS
@@ -184,13 +201,53 @@ def test_cells_keep_the_matches_with_the_largest_sums_of_responses():
         for i, j in np.ndindex(-(-rows // side), -(-columns // side)):
             cell = standard[i * side : (i + 1) * side, j * side : (j + 1) * side]
             v, u = np.add(np.unravel_index(cell.argmax(), cell.shape), (i * side, j * side))
-            row = (cell.max(), view, STRIDE * u, STRIDE * v, angle, size)
+            moments = QUANTUM * sums.mean() / 8, QUANTUM * sums.std() / 8
+            row = (cell.max(), view, STRIDE * u, STRIDE * v, angle, size, *moments)
             cells.setdefault((i, j), []).append(row)
     best = [row for rows in cells.values() for row in sorted(rows)[-NUM_KEPT:]]
     matches = match(responses, templates, size)
-    rows = np.column_stack([matches.scores, matches.views, matches.poses])
+    moments = matches.means, matches.deviations
+    rows = np.column_stack([matches.scores, matches.views, matches.poses, *moments])
     assert len(cells) > 10
-    np.testing.assert_allclose(sorted(rows.tolist()), sorted(best))
+    np.testing.assert_allclose(sorted(rows.tolist()), sorted(best), rtol=1e-5)
+
+
+def test_matching_uses_the_first_points_of_a_template(detector):
+    rng = np.random.default_rng(4)
+    responses = rng.integers(-60, 100, (BINS, 46, 57)).astype(np.int16)
+    templates = detector._groups[0]
+    changed = templates.points.copy()
+    changed[:, NUM_SUMMED:] = 0.0
+    whole, part = (
+        match(responses, replace(templates, points=points), 41.0)
+        for points in (templates.points, changed)
+    )
+    assert templates.points.shape[1] > NUM_SUMMED
+    assert np.array_equal(whole.scores, part.scores)
+
+
+def test_distinct_poses_are_the_first_of_near_duplicates(detector):
+    part, centre = detector.part, detector.part.cuboid[-1]
+
+    def posed(shift, turn=0.0):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec([turn, 0, 0]).as_matrix()
+        T[:3, 3] = np.array([0, 0, 0.3]) + shift - T[:3, :3] @ centre
+        return T
+
+    near, far = 0.5 * SAME_PLACE * part.diameter, 2 * SAME_PLACE * part.diameter
+    poses = [
+        posed([0, 0, 0]),
+        posed([near, 0, 0]),
+        posed([far, 0, 0]),
+        posed([0, 0, 0], 0.5 * SAME_TURN),
+        posed([0, 0, 0], 2 * SAME_TURN),
+        posed([0, 0, 0.3 * 0.5 * SAME_DEPTH]),
+        posed([0, 0, 0.3 * 2 * SAME_DEPTH]),
+    ]
+    assert distinct_poses(poses, part) == [0, 2, 4, 6]
+    assert distinct_poses(poses, part, 2) == [0, 2]
+    assert distinct_poses([], part) == []
 
 
 def test_neighbouring_views_differ_least_after_their_twist():

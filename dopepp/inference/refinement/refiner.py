@@ -144,6 +144,12 @@ class Refiner:
         moved = Prior(T_cam_obj, np.linalg.inv(covariance)).squared_distance(end.T_cam_obj) ** 0.5
         return self.verified(end, image, K, moved)
 
+    def coarse_fit(self, detection: Detection, image: RGBImage, K: CameraMatrix) -> float:
+        """Return the fit of a detection's outline; see :meth:`RegionRefiner.coarse_fit`."""
+        region = self._refiners[detection.object].region
+        assert region is not None  # the caller requires the term ``region``
+        return region.coarse_fit(image, K, detection.T_cam_obj, detection.covariance)
+
     def refine_views(
         self,
         name: str,
@@ -183,7 +189,8 @@ class PartRefiner:
     """
 
     def __init__(self, part: Part, terms: Sequence[str], scale_error: float = SCALE_ERROR) -> None:
-        self._region: RegionRefiner | None = None
+        self.region: RegionRefiner | None = None
+        """Refines on the image; None without the term ``region``."""
         self.verifier: Verifier | None = None
         """Verifies poses refined on the image; None without the term ``region``."""
         if "region" in terms:
@@ -194,8 +201,8 @@ class PartRefiner:
                     f"add --part {part.name}=FILE and its --unit (parts=… in Python), "
                     "or train again",
                 )
-            self._region = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
-            self.verifier = Verifier(self._region.mesh, part.diameter)
+            self.region = RegionRefiner(part.mesh.vertices, part.mesh.faces, scale_error)
+            self.verifier = Verifier(self.region.mesh, part.diameter)
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
         has_surface = self._uses_depth and len(part.points) >= MIN_POINTS
         self._surface = surface_points(part.points) if has_surface else None
@@ -219,10 +226,10 @@ class PartRefiner:
         Raises:
             UndecidedError: The images do not determine the pose.
         """
-        if self._region is None:
+        if self.region is None:
             raise UndecidedError("several views are refined only with refine=region")
         surface = self._surface if self._uses_depth else None
-        return refine_views(self._region, views, start, prior, surface, followed)
+        return refine_views(self.region, views, start, prior, surface, followed)
 
     def refine(
         self,
@@ -251,8 +258,8 @@ class PartRefiner:
         """
         given = np.asarray(T_cam_obj, np.float64)
         by_image = None
-        if self._region is not None:
-            by_image = self._region.refine(image, K, given, covariance, followed, starts)
+        if self.region is not None:
+            by_image = self.region.refine(image, K, given, covariance, followed, starts)
             if depth is None or not self._uses_depth:
                 return by_image
         try:
@@ -262,9 +269,9 @@ class PartRefiner:
                 raise UndecidedError("the part has too few surface points")
             prior = make_prior(given, self._diameter, covariance)
             evidence = DepthEvidence(self._surface, self._diameter, depth, K, prior)
-            if self._region is None or by_image is None:
+            if self.region is None or by_image is None:
                 return _checked(evidence, evidence.descend())
-            return _refine_with_both(self._region, image, K, by_image, evidence)
+            return _refine_with_both(self.region, image, K, by_image, evidence)
         except UndecidedError as undecided:
             return by_image or Refinement(given, reason=str(undecided))
 

@@ -62,9 +62,9 @@ COARSE_SPREAD: Final = 5  # `spread` of the edges in the search, pixels
 FINE_SPREAD: Final = 3  # `spread` of the edges in the ranking, pixels
 
 NUM_RANKED: Final = 16000  # best matches that are ranked
-NUM_TURNED: Final = 2000  # best matches of each octave that are compared with neighbouring views
+NUM_TURNED: Final = 1000  # best matches of each octave that are compared with neighbouring views
 EXTENT: Final = 2.5  # added to the score per diameter of a view's extent, standard deviations
-NUM_STARTS: Final = 100  # start poses
+NUM_STARTS: Final = 60  # start poses
 
 # Two start poses that differ by less are duplicates: refinement would move both to the same pose.
 SAME_PLACE: Final = 0.1  # diameters
@@ -148,7 +148,7 @@ class TemplateDetector:
         order = np.argsort(-odds)
         transforms = self.transforms(views[order], poses[order], crop_camera(K, left, top))
         scores = 1 / (1 + np.exp(-np.clip(odds[order], -30.0, 30.0)))
-        chosen = _distinct(transforms, self._centre, self.part.diameter)
+        chosen = distinct_poses(transforms, self.part, NUM_STARTS)
         return [self.start(transforms[i], float(scores[i]), K) for i in chosen]
 
     def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:
@@ -298,22 +298,25 @@ def _concatenate(groups: Sequence[Matches]) -> Matches:
     return Matches(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
 
-def _distinct(
-    transforms: Float[np.ndarray, "matches 4 4"], centre: np.ndarray, diameter: float
+def distinct_poses(
+    transforms: Sequence[Transform] | Float[np.ndarray, "poses 4 4"],
+    part: Part,
+    most: int | None = None,
 ) -> list[int]:
-    """Return the indices of the poses that do not duplicate an earlier pose."""
-    centres = transforms[:, :3, :3] @ centre + transforms[:, :3, 3]
-    free, chosen = np.ones(len(transforms), bool), []
-    for index in range(len(transforms)):
+    """Return the indices of the first ``most`` poses that do not duplicate an earlier pose."""
+    poses = np.reshape(transforms, (-1, 4, 4))
+    centres = poses[:, :3, :3] @ part.cuboid[-1] + poses[:, :3, 3]
+    free, chosen = np.ones(len(poses), bool), []
+    for index in range(len(poses)):
         if not free[index]:
             continue
         chosen.append(index)
-        if len(chosen) == NUM_STARTS:
+        if len(chosen) == most:
             break
         distances = np.linalg.norm(centres[:, :2] - centres[index, :2], axis=1)
-        trace = np.einsum("nij,ij->n", transforms[:, :3, :3], transforms[index, :3, :3])
+        trace = np.einsum("nij,ij->n", poses[:, :3, :3], poses[index, :3, :3])
         free &= (
-            (distances > SAME_PLACE * diameter)
+            (distances > SAME_PLACE * part.diameter)
             | (np.abs(centres[:, 2] / centres[index, 2] - 1) > SAME_DEPTH)
             | (trace < 1 + 2 * math.cos(SAME_TURN))
         )

@@ -2,7 +2,9 @@
 
 The score of a template is the sum of the responses at its points. Responses are rearranged so that
 the responses of one point at all positions of a grid are contiguous in memory. The scores at all
-positions are then a sum of rows (Hinterstoisser et al. 2012).
+positions are then a sum of rows (Hinterstoisser et al. 2012). Responses are divided by
+``QUANTUM``, so that a byte holds the sum of four of them, and only the first points of a template
+are used, which are far apart.
 
 Scores are normalised by the mean and standard deviation of the template's scores over the image,
 because a template of a few straight lines scores high at many positions.
@@ -14,7 +16,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.inference.templates.responses import Responses
@@ -24,7 +26,10 @@ NUM_ROLLS: Final = 24  # in the image plane, 15 degrees apart
 STRIDE: Final = 4  # pixels between positions
 CELL: Final = 0.2  # side of a cell, diameters
 NUM_KEPT: Final = 8  # best matches of each cell
-TOGETHER: Final = 4  # rows that are added in one pass
+NUM_SUMMED: Final = 32  # points of a template, a multiple of TOGETHER
+TOGETHER: Final = 8  # rows that are added in one pass
+LOWEST: Final = -1e9  # below all scores
+QUANTUM: Final = 4  # unit of the summed responses
 
 Pose2d = Float[np.ndarray, "matches 4"]
 """Pixel of the part's centre, in-plane rotation (radians) and projected diameter (pixels)."""
@@ -64,7 +69,9 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
     shape = (-(-rows // side), -(-columns // side), NUM_KEPT)
     scores, best = np.full(shape, -np.inf), np.zeros((*shape, 3), np.int64)
     moments = np.empty((len(templates.points), NUM_ROLLS, 2))
-    lines = templates.points, templates.normals
+    lines = [
+        np.ascontiguousarray(rows[:, :NUM_SUMMED]) for rows in (templates.points, templates.normals)
+    ]
     _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, best, moments)
     filled = np.isfinite(scores)
     views, rolls, positions = best[filled].T
@@ -75,17 +82,19 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
         rolls * (2 * math.pi / NUM_ROLLS),
         np.full(u.shape, diameter_px),
     ]
-    means, deviations = moments[views, rolls].T / templates.points.shape[1]
+    means, deviations = moments[views, rolls].T * (QUANTUM / lines[0].shape[1])
     return Matches(views, np.column_stack(poses), scores[filled], means, deviations)
 
 
-def _by_phase(responses: Responses, rows: int, columns: int, margin: int) -> Responses:
-    """Rearrange responses by orientation and by row and column modulo the stride."""
+def _by_phase(
+    responses: Responses, rows: int, columns: int, margin: int
+) -> Int8[np.ndarray, "phases positions"]:
+    """Rearrange quantised responses by orientation and by row and column modulo the stride."""
     bins, height, width = responses.shape
     shape = bins, rows + 2 * margin, STRIDE, columns + 2 * margin, STRIDE
-    padded = np.zeros((bins, shape[1] * STRIDE, shape[3] * STRIDE), np.int16)
+    padded = np.zeros((bins, shape[1] * STRIDE, shape[3] * STRIDE), np.int8)
     start = margin * STRIDE
-    padded[:, start : start + height, start : start + width] = responses
+    padded[:, start : start + height, start : start + width] = (responses + QUANTUM // 2) // QUANTUM
     phases = padded.reshape(shape).transpose(0, 2, 4, 1, 3)
     return np.ascontiguousarray(phases.reshape(bins * STRIDE * STRIDE, -1))
 
@@ -100,12 +109,18 @@ def _add(flat: Array, starts: Array, total: Array) -> None:
             flat[starts[p + 2] : starts[p + 2] + count],
             flat[starts[p + 3] : starts[p + 3] + count],
         )
-        if p == 0:
-            for i in range(count):
-                total[i] = np.int16(a[i] + b[i] + c[i] + d[i])
-        else:
-            for i in range(count):
-                total[i] = np.int16(total[i] + a[i] + b[i] + c[i] + d[i])
+        e, f = (
+            flat[starts[p + 4] : starts[p + 4] + count],
+            flat[starts[p + 5] : starts[p + 5] + count],
+        )
+        g, h = (
+            flat[starts[p + 6] : starts[p + 6] + count],
+            flat[starts[p + 7] : starts[p + 7] + count],
+        )
+        before = np.int16(p > 0)
+        for i in range(count):
+            low, high = np.int8(a[i] + b[i] + c[i] + d[i]), np.int8(e[i] + f[i] + g[i] + h[i])
+            total[i] = np.int16(before * total[i] + low + high)
 
 
 @compiled(fastmath=True)
@@ -143,6 +158,7 @@ def _match(
     flat, starts = phases.reshape(-1), np.empty(points.shape[1], np.int64)
     total = np.empty((rows - 1) * across + columns, np.int16)
     highest, weakest = np.empty(columns, np.int16), np.zeros(scores.shape[:2], np.int64)
+    bars = np.full((scores.shape[0], columns), LOWEST, np.float32)  # weakest score of each cell
     for view in range(len(points)):
         for roll in range(rolls):
             angle = 2 * math.pi * roll / rolls
@@ -157,10 +173,12 @@ def _match(
             _add(flat, starts, total)
             mean, square = 0.0, 0.0
             for r in range(rows):
-                row_sum, row_square = 0, 0
-                for k in range(r * across, r * across + columns):
-                    row_sum += total[k]
-                    row_square += np.int32(total[k]) * total[k]
+                row = total[r * across : r * across + columns]
+                row_sum, row_square = np.float32(0.0), np.float32(0.0)
+                for k in range(columns):
+                    value = np.float32(row[k])
+                    row_sum += value
+                    row_square += value * value
                 mean += row_sum
                 square += row_square
             mean /= rows * columns
@@ -173,6 +191,11 @@ def _match(
                     row = total[r * across : r * across + columns]
                     for k in range(columns):
                         highest[k] = max(highest[k], row[k])
+                bar, least, unit, passing = bars[i], np.float32(mean), np.float32(deviation), 0
+                for k in range(columns):
+                    passing += np.float32(highest[k]) - least > bar[k] * unit
+                if not passing:  # a loop over all columns is much faster than one over cells
+                    continue
                 for j in range(scores.shape[1]):
                     left, right, slot = j * side, min((j + 1) * side, columns), weakest[i, j]
                     most = highest[left]
@@ -190,3 +213,4 @@ def _match(
                     best[i, j, slot, 0], best[i, j, slot, 1] = view, roll
                     best[i, j, slot, 2] = position
                     weakest[i, j] = np.argmin(scores[i, j])
+                    bar[left:right] = max(scores[i, j, weakest[i, j]], LOWEST)

@@ -12,7 +12,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Int16
+from jaxtyping import Int8
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import RGBImage
@@ -22,7 +22,7 @@ NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half
 FULL: Final = 127.0  # response of a strong edge of the same orientation
 FAINT: Final = 12.0  # response below which a pixel does not count as an edge
 
-Responses = Int16[np.ndarray, "bins height width"]
+Responses = Int8[np.ndarray, "bins height width"]
 
 
 def edge_responses(image: RGBImage, spread: int, surroundings: int) -> Responses:
@@ -39,10 +39,10 @@ def edge_responses(image: RGBImage, spread: int, surroundings: int) -> Responses
     maps = np.zeros((BINS, *image.shape[:2]), np.uint8)
     _orient(gx, gy, maps)
     kernel = np.ones((spread, spread), np.uint8)
-    responses = np.stack([cv2.dilate(response, kernel) for response in maps]).astype(np.int16)
+    responses = np.stack([cv2.dilate(response, kernel) for response in maps]).astype(np.int8)
     mean = responses.mean(axis=0, dtype=np.float32)
     side = (surroundings, surroundings)
-    responses -= np.rint(cv2.blur(mean, side, borderType=cv2.BORDER_REFLECT)).astype(np.int16)
+    responses -= np.rint(cv2.blur(mean, side, borderType=cv2.BORDER_REFLECT)).astype(np.int8)
     return responses
 
 

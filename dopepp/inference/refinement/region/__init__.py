@@ -49,6 +49,8 @@ MIDDLE: Final = RegionStage(200, reach=0.5, steps=2, points=120, tiles=2)
 FINE: Final = RegionStage(300, reach=0.25, steps=3, points=160, tiles=3)
 """The coarse stage is run from every start, the others from the best results only."""
 
+STAGES: Final = (COARSE, MIDDLE, FINE)
+
 WIDENED: Final = 2.0
 """Factor on the prior's deviations in the coarse round. Far from the correct pose, the points of
 the outline contradict each other, so the image has too little weight against the prior."""
@@ -134,6 +136,30 @@ class RegionRefiner:
         except UndecidedError as undecided:
             return Refinement(given, reason=str(undecided))
 
+    def coarse_fit(
+        self, image: RGBImage, K: CameraMatrix, T_cam_obj: Transform, covariance: PoseMatrix
+    ) -> float:
+        """Return how well the outline fits after the coarse round, to compare many start poses.
+
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            T_cam_obj: Start pose, metres.
+            covariance: Covariance of the start pose, positive definite.
+
+        Returns:
+            ``share`` of :class:`OutlineAgreement`; 0 if the image shows too little of the outline.
+        """
+        prior = Prior(T_cam_obj, np.linalg.inv(covariance))
+        try:
+            (coarse,) = self.rounds(image, K, T_cam_obj, stages=[COARSE])
+            reach = search_distance(coarse, prior)
+            end = _coarse_end(coarse, T_cam_obj, prior, reach)
+            coarse.learn(end, reach)
+            return coarse.agreement(end, reach).share
+        except UndecidedError:
+            return 0.0
+
     def refine_with(
         self, image: RGBImage, K: CameraMatrix, depth: DepthEvidence, start: Solution
     ) -> Outcome:
@@ -157,8 +183,9 @@ class RegionRefiner:
         pose: Transform,
         weights: Weights = FOUND,
         further_terms: Sequence[Term] = (),
+        stages: Sequence[RegionStage] = STAGES,
     ) -> list[Round]:
-        """Return the rounds of optimisation around a pose, from coarse to fine.
+        """Return the rounds of optimisation around a pose, by default from coarse to fine.
 
         Raises:
             UndecidedError: The part is too small, outside the image or behind the camera.
@@ -168,7 +195,6 @@ class RegionRefiner:
         if posed_mesh is None:
             raise UndecidedError("the part reaches behind the camera")
         corners = np.stack([posed_mesh.pixels.min(axis=0), posed_mesh.pixels.max(axis=0)])
-        stages = (COARSE, MIDDLE, FINE)
         crops = [crop_around(image, K, corners, stage.longest_px) for stage in stages]
         return [
             Round(self.mesh, crop, stage, weights, further_terms, self._scale_error)
