@@ -188,7 +188,7 @@ class TemplateEstimator(PoseEstimator):
         if len(starts) <= NUM_REFINED:
             return starts
         assert self.refiner is not None  # templates are always refined
-        with self._timed("refine"):
+        with self.timed("refine"):
             fits = [self.refiner.coarse_fit(start, image, K) for start in starts]
         by_score = np.argsort([-start.score for start in starts], kind="stable")
         by_fit = np.argsort(-np.array(fits), kind="stable")

@@ -69,9 +69,8 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
     shape = (-(-rows // side), -(-columns // side), NUM_KEPT)
     scores, best = np.full(shape, -np.inf), np.zeros((*shape, 3), np.int64)
     moments = np.empty((len(templates.points), NUM_ROLLS, 2))
-    lines = [
-        np.ascontiguousarray(rows[:, :NUM_SUMMED]) for rows in (templates.points, templates.normals)
-    ]
+    points = np.ascontiguousarray(templates.points[:, :NUM_SUMMED])
+    lines = points, np.ascontiguousarray(templates.normals[:, :NUM_SUMMED])
     _match(phases, rows, columns, margin, *lines, diameter_px, side, scores, best, moments)
     filled = np.isfinite(scores)
     views, rolls, positions = best[filled].T
@@ -82,7 +81,7 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
         rolls * (2 * math.pi / NUM_ROLLS),
         np.full(u.shape, diameter_px),
     ]
-    means, deviations = moments[views, rolls].T * (QUANTUM / lines[0].shape[1])
+    means, deviations = moments[views, rolls].T * (QUANTUM / points.shape[1])
     return Matches(views, np.column_stack(poses), scores[filled], means, deviations)
 
 
@@ -171,7 +170,7 @@ def _match(
                 phase = (b * STRIDE + v - down * STRIDE) * STRIDE + u - right * STRIDE
                 starts[p] = phase * length + first + down * across + right
             _add(flat, starts, total)
-            mean, square = 0.0, 0.0
+            mean = square = 0.0
             for r in range(rows):
                 row = total[r * across : r * across + columns]
                 row_sum, row_square = np.float32(0.0), np.float32(0.0)
@@ -179,8 +178,8 @@ def _match(
                     value = np.float32(row[k])
                     row_sum += value
                     row_square += value * value
-                mean += row_sum
-                square += row_square
+                mean += float(row_sum)
+                square += float(row_square)
             mean /= rows * columns
             deviation = math.sqrt(max(square / (rows * columns) - mean * mean, 1.0))
             moments[view, roll, 0], moments[view, roll, 1] = mean, deviation
