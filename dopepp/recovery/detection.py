@@ -143,7 +143,7 @@ class RecoveryOptions:
     peak_threshold: _Belief = 0.02
     centroid_threshold: _Belief = 0.05
     max_angle_deg: Annotated[float, Range(1e-3, 180.0, "degrees")] = 45.0
-    max_peaks: Annotated[int, Range(1, 1000)] = 16
+    max_peaks: Annotated[int, Range(1, 1000)] = 64
     min_score: _Score = 0.5
     distance_factor: Annotated[float, Range(*DISTANCE_FACTORS)] = 1.0
     covariance_factor: Annotated[float, Range(*COVARIANCE_FACTORS)] = 1.0
