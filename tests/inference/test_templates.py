@@ -24,6 +24,7 @@ from dopepp.inference.templates import (
 )
 from dopepp.inference.templates.matching import (
     CELL,
+    MOST,
     NUM_KEPT,
     NUM_ROLLS,
     NUM_SUMMED,
@@ -180,13 +181,13 @@ def test_a_flat_image_has_no_responses_and_finite_starts(detector):
 
 def test_cells_keep_the_matches_with_the_largest_sums_of_responses():
     rng, size = np.random.default_rng(1), 41.0
-    responses = rng.integers(-60, 100, (BINS, 46, 57)).astype(np.int16)
+    responses = rng.integers(-127, 128, (BINS, 46, 57)).astype(np.int8)
     points, normals = rng.uniform(-0.5, 0.5, (3, 8, 2)), rng.uniform(-np.pi, np.pi, (3, 8))
     ones, links = np.ones((3, 8), bool), np.zeros((3, 1))
     rotations = np.tile(np.eye(3), (3, 1, 1))
     templates = Templates(rotations, points, normals, ones, points, ones[:, 0], links, links)
     rows, columns, pad = len(range(0, 46, STRIDE)), len(range(0, 57, STRIDE)), 40
-    quantised = np.floor(responses / QUANTUM + 0.5)
+    quantised = np.minimum(np.floor(responses / QUANTUM + 0.5), MOST)
     padded = np.pad(quantised, ((0, 0), (pad, pad), (pad, pad)))
     side, cells = round(CELL * size / STRIDE), {}
     for view, roll in np.ndindex(3, NUM_ROLLS):
@@ -214,7 +215,7 @@ def test_cells_keep_the_matches_with_the_largest_sums_of_responses():
 
 def test_matching_uses_the_first_points_of_a_template(detector):
     rng = np.random.default_rng(4)
-    responses = rng.integers(-60, 100, (BINS, 46, 57)).astype(np.int16)
+    responses = rng.integers(-127, 128, (BINS, 46, 57)).astype(np.int8)
     templates = detector._groups[0]
     changed = templates.points.copy()
     changed[:, NUM_SUMMED:] = 0.0

@@ -30,6 +30,7 @@ NUM_SUMMED: Final = 32  # points of a template, a multiple of TOGETHER
 TOGETHER: Final = 8  # rows that are added in one pass
 LOWEST: Final = -1e9  # below all scores
 QUANTUM: Final = 4  # unit of the summed responses
+MOST: Final = 31  # largest quantised response
 
 Pose2d = Float[np.ndarray, "matches 4"]
 """Pixel of the part's centre, in-plane rotation (radians) and projected diameter (pixels)."""
@@ -93,7 +94,9 @@ def _by_phase(
     shape = bins, rows + 2 * margin, STRIDE, columns + 2 * margin, STRIDE
     padded = np.zeros((bins, shape[1] * STRIDE, shape[3] * STRIDE), np.int8)
     start = margin * STRIDE
-    padded[:, start : start + height, start : start + width] = (responses + QUANTUM // 2) // QUANTUM
+    quantised = (responses.astype(np.int16) + QUANTUM // 2) // QUANTUM
+    quantised = np.minimum(quantised, MOST)  # the sum of four fits into a byte
+    padded[:, start : start + height, start : start + width] = quantised
     phases = padded.reshape(shape).transpose(0, 2, 4, 1, 3)
     return np.ascontiguousarray(phases.reshape(bins * STRIDE * STRIDE, -1))
 
