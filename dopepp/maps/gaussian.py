@@ -90,8 +90,9 @@ def fit_peaks(
         squared, used = _linearised(
             windows[i], usable[i], theta[i], 0.0, sigma, work, workspace[0], hessian[i]
         )
-        noise += squared * scores[i] ** 2
-        freedom += max(used - 6.0, 0.0)
+        if squared <= used:  # residuals above the peak itself: noise beside a higher peak
+            noise += squared * scores[i] ** 2
+            freedom += max(used - 6.0, 0.0)
     noise /= max(freedom, 1.0)
     for i in range(count):
         relative = noise / scores[i] ** 2

@@ -121,16 +121,21 @@ def test_seen_on_selects_preset_and_rotations(seen_on, preset, turning, parsed):
 
 
 @pytest.mark.parametrize(
-    ("materials", "metal", "prints"),
-    [("mixed", None, None), ("metal", 0.8, None), ("plastic", 0.0, 0.0), ("print", 0.0, 1.0)],
+    ("materials", "changes"),
+    [
+        ("mixed", {}),
+        ("metal", {"metal_share": 0.8, "metal_roughness": (0.1, 0.5)}),
+        ("plastic", {"metal_share": 0.0, "print_share": 0.0}),
+        ("print", {"metal_share": 0.0, "print_share": 1.0}),
+    ],
 )
 @pytest.mark.parametrize("seen_on", ["front", "bin"])
-def test_materials_changes_the_shares_of_metal_and_prints(
-    seen_on, materials, metal, prints, parsed
+def test_materials_changes_the_surfaces_and_shows_panels_to_metals(
+    seen_on, materials, changes, parsed
 ):
     options = ("experiment=my_part", f"seen_on={seen_on}")
-    mixture = parsed(*options).data.preset.materials
-    expected = {"metal_share": metal, "print_share": prints}
-    expected = {name: share for name, share in expected.items() if share is not None}
-    chosen = parsed(*options, f"materials={materials}").data.preset.materials
-    assert chosen == replace(mixture, **expected)
+    mixture = parsed(*options).data.preset
+    chosen = parsed(*options, f"materials={materials}").data.preset
+    assert chosen.materials == replace(mixture.materials, **changes)
+    assert (chosen.lighting == mixture.lighting) == (materials != "metal")
+    assert chosen.lighting.num_panels == ((1, 5) if materials == "metal" else (0, 0))

@@ -107,7 +107,7 @@ ACCEPTED = {
     "optimizer.weight_decay=0.5": "optimizer.weight_decay: 0.01 → 0.5",
     "trainer.precision=32-true": "trainer.precision: auto → 32-true",
     "callbacks.overlays.num_images=3": "callbacks.overlays.num_images: 12 → 3",
-    "recovery.max_peaks=3": "recovery.max_peaks: 16 → 3",
+    "recovery.max_peaks=3": "recovery.max_peaks: 64 → 3",
     "logger=tensorboard": "logger.tensorboard.name: not set → tensorboard",
 }
 
