@@ -69,7 +69,7 @@ def arrange_heap(
     beside = math.inf
     if preset.window is not None:  # a window shows few of the objects
         beside = _BESIDE * diameter * focal_length(composition.K)
-    for _ in range(_TRIALS):
+    for trial in range(_TRIALS):
         T_cam_table = draw_view(table, composition)
         turn = rotation_vector_to_matrix(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))
         shift = np.array([*rng.uniform(-pile.aside, pile.aside, 2) * reach, 0.0])
@@ -79,7 +79,9 @@ def arrange_heap(
             T_cam_obj = T_cam_pile @ pose
             hull = transform(T_cam_obj, body.surface.hull)
             if hull[:, 2].min() <= NEAR:
-                break
+                if trial + 1 < _TRIALS:
+                    break
+                continue  # a high heap around the camera is shown without its top
             image = project(hull, composition.K)
             lower, upper = image.min(axis=0), image.max(axis=0)
             outside = np.max([-0.5 - upper, lower - np.array(composition.size) + 0.5])  # pixels

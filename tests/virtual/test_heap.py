@@ -184,6 +184,17 @@ def test_a_window_omits_only_objects_that_are_far_beside_it(box_part, monkeypatc
                 assert not (shown == number).any()
 
 
+def test_a_heap_that_reaches_the_camera_is_shown_without_its_top(box_part):
+    # The camera is 12 cm above the table, the heap of 30 boxes in a narrow bin is higher.
+    table = {"pile": {"bin_share": 1.0, "room": [0.5, 0.6]}, "distance": [0.12, 0.12]}
+    table["elevation_deg"] = [89.0, 90.0]
+    factory = Factory([box_part], small(targets_per_image=[30, 30], table=table), 3)
+    for index in range(3):
+        targets = in_table_frame(factory.scene(0, index))
+        assert 0 < len(targets) < 30
+        assert max(pose[2, 3] for pose in targets) < 0.12
+
+
 def test_both_renderers_draw_a_heap(heaps):
     scene = heaps[0]
     fractions = find_renderer("raster")(scene).visible_fractions
