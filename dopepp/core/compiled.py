@@ -29,7 +29,8 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
     by zero follows IEEE 754, as in numpy; a check would prevent vectorised loops.
 
     The machine code is cached next to the package, or in the user's cache folder if the package is
-    read-only; ``NUMBA_CACHE_DIR`` overrides both. Plain loops compile many times faster than slice
+    read-only; ``NUMBA_CACHE_DIR`` overrides both. The code of a function is not renewed when a
+    function that it calls in another file changes: delete the cache (``*.nbc``). Plain loops compile many times faster than slice
     assignments, array expressions and calls with constants.
     """
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)

@@ -132,7 +132,7 @@ def find_peaks(
     belief: Float[Tensor, "batch channels height width"],
     geometry: MapGeometry,
     threshold: float = 0.05,
-    max_peaks: int = 16,
+    max_peaks: int = 64,
     field: Fields | None = None,
 ) -> Peaks:
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
