@@ -30,8 +30,10 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
 
     The machine code is cached next to the package, or in the user's cache folder if the package is
     read-only; ``NUMBA_CACHE_DIR`` overrides both. The code of a function is not renewed when a
-    function that it calls in another file changes: delete the cache (``*.nbc``). Plain loops compile many times faster than slice
-    assignments, array expressions and calls with constants.
+    function that it calls in another file changes: delete the cache (``*.nbc``).
+
+    Plain loops compile many times faster than slice assignments, array expressions and calls with
+    constants.
     """
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     return cast("Callable[[Function], Function]", compiler)
