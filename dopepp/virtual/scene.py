@@ -90,8 +90,8 @@ class Light:
 class Panel:
     """A distant lamp tube or window with soft edges, which metals mirror.
 
-    The radiance in direction x is exp(−½ (a²/width² + b²/length²)) times ``intensity``, with the
-    components a across and b along the panel, and falls to 0 behind the camera's half space of x.
+    The radiance in a unit direction with the components a across, b along and c towards the panel
+    is ``intensity`` · exp(−½ (a²/width² + b²/length²)), times ½ + 2c limited to 0 … 1.
 
     Attributes:
         middle: Unit vector to the panel's middle, camera frame.

@@ -195,8 +195,8 @@ def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
     right, across, up = rotation_to_z(up)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, up, -across], axis=1)  # Mitsuba's zenith is +y
+    directions = _sky_directions(rows) @ pose[:3, :3].T
     for panel in ambient.panels:
-        directions = _sky_directions(rows) @ pose[:3, :3].T
         front = np.clip(0.5 + 2 * directions @ np.array(panel.middle), 0.0, 1.0)
         sideways = directions @ panel.across / panel.width
         lengthways = directions @ np.array(panel.along) / panel.length

@@ -75,7 +75,8 @@ def shade_object(
     look_up_sky(fragments.face, fragments.share, sky.steps, sky.firsts, sky.values, opened)
     ambient = ambient_row(scene.ambient)
     reflect_ambient(fragments, opened, ambient, material.metallic, radiance)
-    reflect_panels(fragments, opened, panel_rows(scene.ambient), material.metallic, radiance)
+    if scene.ambient.panels:
+        reflect_panels(fragments, opened, panel_rows(scene.ambient), material.metallic, radiance)
     for shadow in lights:
         lit = shadow.lit_shares(fragments.position, fragments.normal, fragments.bulge)
         specular, metallic = material.specular, material.metallic
