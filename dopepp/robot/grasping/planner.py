@@ -318,8 +318,9 @@ class Planner:
             self._cell.put(self._state, 0, self.arm.flange(joints) @ T_flange_obj)
             if self._collides(joints, width, carries=True):
                 freedom = 0.0
-            elif self._is_part_hit():
-                freedom = min(freedom, DISTURBING)
+                break
+            if self._is_part_hit():
+                freedom = DISTURBING
         self._cell.put(self._state, 0, T_base_obj)
         return freedom
 
