@@ -27,6 +27,7 @@ from dopepp.cli.common import (
 )
 from dopepp.core.errors import UserError, require
 from dopepp.core.validation import Range, check
+from dopepp.robot.nodes.pairing import MAX_LAG_S
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
@@ -99,6 +100,7 @@ def node(
         for_several: dict[str, object] = {"--views": views, "--world": world, "--lag": lag}
         for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
         _check_topics(topics, transport, for_one if len(topics) > 1 else for_several)
+        max_lag_s = check("--lag", MAX_LAG_S if lag is None else lag, float, Range(0, 10))
         check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
@@ -123,10 +125,8 @@ def node(
         else:
             worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":
-            from dopepp.robot.nodes.pairing import MAX_LAG_S
             from dopepp.robot.nodes.ros2 import run
 
-            max_lag_s = check("--lag", MAX_LAG_S if lag is None else lag, float, Range(0, 10))
             run(worker, topics, name, params, max_lag_s)
             return
 
@@ -173,9 +173,9 @@ def _check_topics(topics: Sequence[str], transport: str, excluded: Mapping[str, 
     if len(topics) > 1 and transport != "--ros2":
         fix = "pass one --topic, or use --ros2"
         raise UserError(f"{len(topics)} topics with {transport}", "one topic", fix)
-    if len(set(topics)) < len(topics):
+    if repeated := [topic for topic in topics if topics.count(topic) > 1]:
         fix = "pass the topic of another camera"
-        raise UserError(f"--topic {topics[0]} twice", "different topics", fix)
+        raise UserError(f"--topic {repeated[0]} twice", "different topics", fix)
     if given := ", ".join(option for option, value in excluded.items() if value is not None):
         number = "several topics" if len(topics) > 1 else "one topic"
         raise UserError(f"{given} with {number}", f"{number} without it", f"leave out {given}")
