@@ -5,52 +5,44 @@ python docs/make_materials_picture.py    # needs the extras robot and photoreal
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import cv2
-import numpy as np
 import yaml
 
+from dopepp.core.files import write_image
+from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual import PRESETS, Factory
-from dopepp.virtual.presets import Preset
+from dopepp.virtual import Factory
+from dopepp.virtual.presets import preset_of
 
+DOCS: Final = Path(__file__).parent
 SIZE: Final = (400, 300)
 IMAGE: Final = 3  # number of the heap
 KINDS: Final = {
-    "plastic": {"metal_share": 0.0, "print_share": 0.0},
-    "print": {"metal_share": 0.0, "print_share": 1.0},
-    "metal": {"metal_share": 1.0, "brushed_share": 0.0},
-    "brushed metal": {"metal_share": 1.0, "brushed_share": 1.0},
+    "plastic": ("plastic", {}),
+    "print": ("print", {}),
+    "metal": ("metal", {"metal_share": 1.0, "brushed_share": 0.0}),
+    "brushed metal": ("metal", {"metal_share": 1.0, "brushed_share": 1.0}),
 }
+"""The group ``materials`` of each column, and changes to it."""
 
 
-def preset_of(options: dict[str, float]) -> Preset:
-    """Return the preset ``heap`` with a material; metals mirror the panels of ``metal.yaml``."""
-    metal = yaml.safe_load((Path(__file__).parents[1] / "conf/materials/metal.yaml").read_text())
-    heap = PRESETS["heap"].resized(*SIZE)
-    panels = tuple(metal["virtual"]["scene"]["lighting"]["num_panels"])
-    lighting = replace(heap.lighting, num_panels=panels)
-    materials = replace(heap.materials, alike_share=1.0, **options)
-    return replace(heap, materials=materials, lighting=lighting)
+def tile(name: str, renderer: str) -> Tile:
+    """Return a heap of a material with a caption."""
+    group, changes = KINDS[name]
+    config = yaml.safe_load((DOCS.parent / f"conf/materials/{group}.yaml").read_text("utf-8"))
+    scene = config["virtual"]["scene"]
+    scene["materials"] |= {"alike_share": 1.0, **changes}
+    preset = preset_of("heap", scene).resized(*SIZE)
+    factory = Factory([pivconnector()], preset, seed=0, renderer=renderer)
+    return Tile(factory.render(0, IMAGE).image, f"{name}, {renderer}")
 
 
 def main() -> None:
     """Render the eight images and write them as one file."""
-    rows = []
-    for renderer in ("raster", "photoreal"):
-        images = []
-        for name, options in KINDS.items():
-            factory = Factory([pivconnector()], preset_of(options), seed=0, renderer=renderer)
-            image = np.ascontiguousarray(factory.render(0, IMAGE).image[..., ::-1])
-            label = f"{name}, {renderer}"
-            cv2.putText(image, label, (8, 20), 0, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
-            images.append(image)
-        rows.append(np.hstack(images))
-    path = Path(__file__).parent / "images/materials.jpg"
-    cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 88])
+    tiles = [tile(name, renderer) for renderer in ("raster", "photoreal") for name in KINDS]
+    write_image(DOCS / "images/materials.jpg", contact_sheet(tiles, len(KINDS), SIZE[0]))
 
 
 if __name__ == "__main__":
