@@ -76,10 +76,16 @@ def encode(
         geometry: Stride, peak width and disc radius.
     """
     height, width = map_size
-    batch, instances = object_index.shape
     cells = geometry.to_cells(keypoints.float())
     on_map = ((cells > -0.5) & (cells < cells.new_tensor([width - 0.5, height - 0.5]))).all(-1)
     drawn = on_map & (object_index >= 0)[..., None]
+    # In a window of a heap, most instances have no keypoint on the map.
+    has_keypoint = drawn.any(-1)
+    instances = max(has_keypoint.sum(-1).tolist(), default=0)
+    order = has_keypoint.int().argsort(dim=-1, descending=True, stable=True)[:, :instances]
+    rows = torch.arange(len(cells), device=cells.device)
+    cells, drawn = cells[rows[:, None], order], drawn[rows[:, None], order]
+    object_index = object_index.gather(1, order)
     x = torch.arange(width, device=cells.device) - cells[..., 0, None]
     y = torch.arange(height, device=cells.device) - cells[..., 1, None]
 
@@ -87,12 +93,11 @@ def encode(
     vectors = torch.nn.functional.normalize(toward, dim=-1)
     has_vector = drawn[..., :NUM_CORNERS] & torch.isfinite(vectors).all(-1)
 
-    belief = cells.new_zeros(batch, num_objects, NUM_KEYPOINTS, height, width)
-    field = cells.new_zeros(batch, num_objects, NUM_CORNERS, 2, height, width)
+    belief = cells.new_zeros(len(cells), num_objects, NUM_KEYPOINTS, height, width)
+    field = cells.new_zeros(len(cells), num_objects, NUM_CORNERS, 2, height, width)
     nearest = cells.new_full(
-        (batch, num_objects, NUM_CORNERS, height, width), geometry.field_radius**2
+        (len(cells), num_objects, NUM_CORNERS, height, width), geometry.field_radius**2
     )
-    rows = torch.arange(batch, device=cells.device)
     for n in range(instances):
         slot = (rows, object_index[:, n].clamp(min=0))
         squared = y[:, n, :, :, None] ** 2 + x[:, n, :, None, :] ** 2

@@ -48,6 +48,7 @@ def test_maps_agree_with_their_definition():
     keypoints[0, 1] = keypoints[0, 0] + rng.uniform(-12, 12, (9, 2))
     keypoints[0, 2, 8] = keypoints[1, 0, 3] = np.nan
     keypoints[1, 1, 8] = (900.0, -700.0)
+    keypoints[1, 2] = (-500.0, 40.0)  # a whole instance beside the map
     # Absent keypoints, then keypoints beside and on the border of the map.
     keypoints[2, 2, :5] = [[np.nan, 40], [np.inf, 40], [-0.6, 40], [40, 88], [1e30, 0]]
     keypoints[2, 2, 5:7] = [[-0.4, 40], [40, 87.4]]
