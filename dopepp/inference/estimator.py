@@ -34,7 +34,7 @@ from dopepp.inference.network_input import (
 from dopepp.inference.pose_result import STEPS
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import CANDIDATE, Detection, RecoveryOptions, recalibrate
+from dopepp.recovery.detection import CANDIDATE, PROBABLE, Detection, RecoveryOptions, recalibrate
 from dopepp.recovery.recover import Reason, explain, recover, refined_reason
 
 if TYPE_CHECKING:
@@ -298,12 +298,23 @@ class PoseEstimator:
                 belief, field = self.maps(view.pixels)
             with self.timed("decode"):
                 detections = recover(
-                    belief, field, self.cuboids, view.K, stride, self._names, **options
-                )
+                    belief, field, self.cuboids, view.K, stride, self._names,
+                    self._searched_depths(view), **options,
+                )  # fmt: skip
             scales.append(
                 [view.to_image(item, self._cuboid_of[item.object], K) for item in detections]
             )
         return merge_scales(scales)
+
+    def _searched_depths(self, view: NetworkView) -> list[tuple[float, float] | None] | None:
+        """Return the depths in which poses of each part are searched; None without verification."""
+        if self.refiner is None or not self.refiner.verifies:
+            return None
+        seen = self.checkpoint.seen
+        return [
+            view.depths(seen[part.name], part.diameter) if part.name in seen else None
+            for part in self.parts
+        ]
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Replace scores and covariances by those fitted for refined poses; see `recalibrate`."""
@@ -364,8 +375,12 @@ class PoseEstimator:
                 if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
                     unrefined = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
                     refined.append(self.refiner.verified(unrefined, image, K))
-                else:
-                    refined.append(self.refiner(detection, image, K, depth))
+                    continue
+                best = self.refiner(detection, image, K, depth)
+                if detection.alternative is not None and (best.probability or 0.0) < PROBABLE:
+                    other = self.refiner(detection.alternative, image, K, depth)
+                    best = max(best, other, key=lambda pose: pose.probability or 0.0)
+                refined.append(replace(best, alternative=None))
         return refined
 
     def stream(

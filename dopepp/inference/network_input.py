@@ -189,12 +189,19 @@ class NetworkView:
 
     def to_image(self, detection: Detection, cuboid: Cuboid, K: CameraMatrix) -> Detection:
         """Express a detection in pixels of the whole image, whose camera matrix is K."""
+        other = detection.alternative
         return replace(
             detection,
             keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
             peaks=self.box.original_points(detection.peaks) + np.array(self.corner),
             reprojection_error_px=detection.reprojection_error_px / self.box.scale_x,
+            alternative=None if other is None else self.to_image(other, cuboid, K),
         )
+
+    def depths(self, seen: LearnedRange, diameter: float) -> tuple[float, float]:
+        """Return the depths (metres) at which a part has a size in this input as in training."""
+        reach = diameter * focal_length(self.K)
+        return reach / (MARGIN * seen.largest_px), MARGIN * reach / seen.smallest_px
 
 
 def network_views(

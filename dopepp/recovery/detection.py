@@ -45,6 +45,9 @@ REFINED_COVARIANCE_FACTORS: Final = (0.1, 4.0)
 """Range for refined poses. Refinement assumes errors that renders do not have, e.g. shadows and
 inaccurate meshes, so its covariances are too large on renders."""
 
+PROBABLE: Final = 0.5
+"""Score or probability from which no alternative of a pose is searched or refined."""
+
 PASSING: Final = 0.1  # ADD, in diameters, below which a pose is correct
 
 # Squared Mahalanobis distances that 75 % and 10 % of 6D Gaussian errors exceed.
@@ -87,6 +90,8 @@ class Detection:
             the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
             refinement by region.
         start: Pose and covariance from which refinement started; None without refinement.
+        alternative: Further hypothesis of the same instance, found by :mod:`~.search`. Refinement
+            tries it if the first pose is probably wrong, and keeps the more probable pose.
     """
 
     object: str
@@ -102,6 +107,7 @@ class Detection:
     support: float | None = None
     probability: float | None = None
     start: tuple[Transform, Float[np.ndarray, "6 6"]] | None = None
+    alternative: Detection | None = None
 
 
 _Belief = Annotated[float, Range(1e-6, 1.0)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -24,7 +24,8 @@ from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
-from dopepp.recovery.detection import Detection, RecoveryOptions, make_detection
+from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, make_detection
+from dopepp.recovery.search import Depths, search_instance
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -74,6 +75,7 @@ def recover(
     K: CameraMatrix,
     stride: int = 8,
     names: Sequence[str] | None = None,
+    depths: Sequence[Depths | None] | None = None,
     **options: float,
 ) -> list[Detection]:
     """Recover the poses of all objects in one image from its maps.
@@ -85,13 +87,17 @@ def recover(
         K: Camera matrix of the network's input, pixels.
         stride: Pixels of the network's input per cell.
         names: Names of the objects (default: their indices).
+        depths: Nearest and farthest depth of each object, metres. Poses of instances whose score is
+            below :data:`PROBABLE` are also searched in this range (:mod:`~.search`), as
+            ``Detection.alternative``. None (the default): no search.
         **options: Fields of :class:`RecoveryOptions`.
 
     Returns:
         Detections of all objects, by descending score.
     """
+    camera = np.asarray(K)[None]
     return recover_batch(
-        belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, None, **options
+        belief[None], field[None], cuboids, camera, stride, names, None, depths, **options
     )[0]
 
 
@@ -103,6 +109,7 @@ def recover_batch(
     stride: int = 8,
     names: Sequence[str] | None = None,
     reasons: list[Reason] | None = None,
+    depths: Sequence[Depths | None] | None = None,
     **options: float,
 ) -> list[list[Detection]]:
     """Return the result of :func:`recover` for each image of a batch.
@@ -133,15 +140,25 @@ def recover_batch(
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
             own_peaks = select_peaks(peaks, image, c, chosen.centroid_threshold, cells, stride)
             instances = solve_instances(own_peaks, cuboid, camera, max_angle, float(stride))
+            beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
+            reach = None if depths is None else depths[c]
+            maps = None if reach is None else beliefs.float().cpu().numpy()
             for group, result in instances:
                 detection = make_detection(group, result, cuboid, camera, name, chosen)
+                is_probable = detection is not None and detection.score >= PROBABLE
+                if reach is not None and maps is not None and not is_probable:
+                    place = cuboid, camera, stride, reach, name, chosen
+                    other = search_instance(maps, own_peaks, group, *place)
+                    if detection is None or detection.score < chosen.min_score:
+                        detection = other
+                    else:
+                        detection = replace(detection, alternative=other)
                 if detection is not None and detection.score >= chosen.min_score:
                     detections.append(detection)
                 elif reasons is not None:
                     kind, best, text = _rejected(group, result, detection, chosen, cells, stride)
                     reasons.append(Reason(name, kind, best, text))
             if reasons is not None and not instances:
-                beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
                 reasons.append(_no_centroid(beliefs, name, chosen))
         batch.append(sorted(detections, key=lambda detection: -detection.score))
     return batch
@@ -159,7 +176,9 @@ def explain(
     """Return why objects and candidates (centroid peaks) are not detected; see :func:`recover`."""
     reasons: list[Reason] = []
     camera = np.asarray(K)[None]
-    recover_batch(belief[None], field[None], cuboids, camera, stride, names, reasons, **options)
+    recover_batch(
+        belief[None], field[None], cuboids, camera, stride, names, reasons, None, **options
+    )
     return reasons
 
 

@@ -307,6 +307,31 @@ def test_region_refines_on_the_image(parts_path):
     assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
 
 
+def test_the_more_probable_hypothesis_is_kept(parts_path, monkeypatch):
+    estimator, rendered = oracle_and_render(parts_path, "region", nearer=0.0)
+    right = estimator.predict(rendered.image, K_VGA)[0]
+    beside = make_transform(TRUE[:3, :3], TRUE[:3, 3] + (0.05, -0.05, 0.0))  # on the wall
+    wrong = replace(right, T_cam_obj=beside)
+    begun = []
+    refiner = estimator.refiner
+
+    def recorded(detection, *others):
+        begun.append(detection.T_cam_obj)
+        return refiner(detection, *others)
+
+    monkeypatch.setattr(estimator, "refiner", recorded)
+    given = [
+        replace(wrong, alternative=right),
+        replace(right, alternative=wrong),
+        replace(wrong, alternative=wrong),
+    ]
+    mended, kept, lost = estimator.refined(given, rendered.image, K_VGA)
+    assert error(mended.T_cam_obj) < 0.001
+    assert mended.probability == kept.probability > 0.9 > 0.5 > lost.probability
+    assert all(detection.alternative is None for detection in (mended, kept, lost))
+    assert len(begun) == 5  # the alternative of a probable pose is not refined
+
+
 def test_refinement_stops_at_the_time_limit(parts_path):
     estimator, rendered = oracle_and_render(parts_path, "region", max_ms=0.0)
     assert estimator.predict(rendered.image, K_VGA)[0].kept == "max_ms=0 was spent"

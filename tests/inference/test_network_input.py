@@ -15,18 +15,27 @@ from numpy.testing import assert_allclose
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Letterbox, camera_matrix, resize_camera, transform
+from dopepp.geometry.camera import (
+    Letterbox,
+    camera_matrix,
+    make_transform,
+    project_keypoints,
+    resize_camera,
+    transform,
+)
 from dopepp.inference.network_input import (
     MARGIN,
     MAX_PIXELS,
     check_depth,
     letterboxes,
     merge_scales,
+    network_views,
     read_depth_image,
     undistort_depth,
 )
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.size import LearnedRange
+from dopepp.recovery import Detection
 from dopepp.virtual import PRESETS, Factory, render
 
 SEEN = LearnedRange(48.0, 98.0, 0.12, 0.25)
@@ -226,3 +235,24 @@ def test_read_depth(tmp_path):
     cv2.imwrite(str(path), np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(UserError, match="16 bits"):
         read_depth_image(path, 0.001)
+
+
+def test_depths_of_a_view_show_the_part_at_trained_sizes():
+    K = camera_matrix(600.0, 600.0, 320.0, 240.0)
+    for view in network_views(checkpoint(diameter=0.1), 32, blank_image(640, 480), K):
+        near, far = view.depths(SEEN, 0.1)
+        largest, smallest = (view.K[0, 0] * 0.1 / depth for depth in (near, far))
+        assert_allclose([largest / MARGIN, smallest * MARGIN], [98.0, 48.0])
+
+
+def test_alternatives_are_expressed_in_pixels_of_the_image():
+    cuboid = load_part("pivconnector").cuboid
+    T, K = make_transform(np.eye(3), np.array([0.0, 0.0, 0.3])), camera_matrix(600, 600, 320, 240)
+    region = network_views(checkpoint(), 32, blank_image(640, 480), K, roi=(40, 20, 320, 240))[0]
+    keypoints = project_keypoints(cuboid, T, region.K)
+    found = Detection("part", 0.1, 0.1, T, keypoints, keypoints, 2.0, np.eye(6))
+    moved = region.to_image(replace(found, alternative=found), cuboid, K).alternative
+    expected = project_keypoints(cuboid, T, K)
+    assert_allclose(moved.keypoints, expected)
+    assert_allclose(moved.peaks, expected)
+    assert moved.reprojection_error_px == pytest.approx(2.0 * K[0, 0] / region.K[0, 0])

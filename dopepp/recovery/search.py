@@ -1,0 +1,182 @@
+"""Search for an instance's pose in the belief maps, without peaks and their association.
+
+In a heap, many corners are hidden or lie beside the corners of other parts, and too few peaks
+belong to an instance for PnP. Its centroid is still visible. At a centroid peak, the search tries
+sampled rotations at several depths, and sums the logarithms of the beliefs at the projected
+corners. A corner without belief costs little, so wrong corners of neighbours do not matter.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    focal_length,
+    make_transform,
+    project_keypoints,
+)
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.geometry.rotation import Vector
+from dopepp.recovery.association import KeypointGroup, ObjectPeaks
+from dopepp.recovery.detection import Detection, RecoveryOptions, calibrate
+
+Beliefs = Float[np.ndarray, "9 height width"]
+Depths = tuple[float, float]  # nearest and farthest depth, metres
+
+ROTATION_DEVIATION: Final = 0.3  # standard deviation of a searched rotation, radians
+DEPTH_DEVIATION: Final = 0.08  # standard deviation of a searched depth, relative
+CENTROID_DEVIATION: Final = 0.4  # standard deviation of a centroid's peak, cells
+
+_NUM_ROTATIONS: Final = 6000  # neighbours are about 12° apart
+_STEP: Final = 0.17  # largest difference between logarithms of tried depths
+_FLOOR: Final = 0.02  # belief added before the logarithm, for corners without belief
+
+
+def search_instance(
+    belief: Beliefs,
+    peaks: ObjectPeaks,
+    group: KeypointGroup,
+    cuboid: Cuboid,
+    K: CameraMatrix,
+    stride: int,
+    depths: Depths,
+    name: str,
+    options: RecoveryOptions,
+) -> Detection:
+    """Return the calibrated detection of an instance with the pose of :func:`search_pose`.
+
+    Its keypoints are the nearest peaks within a cell of the projected keypoints.
+
+    Args:
+        belief: See :func:`search_pose`.
+        peaks: All peaks of the object.
+        group: Keypoints of the instance, of which only the centroid is used.
+        cuboid: See :func:`search_pose`.
+        K: See :func:`search_pose`.
+        stride: See :func:`search_pose`.
+        depths: See :func:`search_pose`.
+        name: Name of the part.
+        options: Options with the factors of distance and covariance and the score's weights.
+    """
+    T = search_pose(belief, group.position[CENTROID], cuboid, K, stride, depths)
+    projected = project_keypoints(cuboid, T, K)
+    distances = np.linalg.norm(peaks.position - projected[:NUM_CORNERS, None], axis=2)
+    distances[np.isnan(distances)] = math.inf
+    points, scores = np.full((NUM_KEYPOINTS, 2), np.nan), np.zeros(NUM_KEYPOINTS)
+    points[CENTROID], scores[CENTROID] = group.position[CENTROID], group.score[CENTROID]
+    for corner, nearest in enumerate(distances.argmin(axis=1)):
+        if distances[corner, nearest] < stride:
+            points[corner] = peaks.position[corner, nearest]
+            scores[corner] = peaks.score[corner, nearest]
+    mean = float(scores.clip(0.0, 1.0).mean())
+    detection = Detection(
+        object=name,
+        score=mean,
+        belief=mean,
+        T_cam_obj=T,
+        keypoints=projected,
+        peaks=points,
+        reprojection_error_px=math.sqrt(np.nanmean(((points - projected) ** 2).sum(axis=1))),
+        covariance=search_covariance(T, cuboid, focal_length(K), stride),
+    )
+    return calibrate(detection, cuboid, K, options)
+
+
+def search_pose(
+    belief: Beliefs,
+    centroid: Float[np.ndarray, "2"],
+    cuboid: Cuboid,
+    K: CameraMatrix,
+    stride: int,
+    depths: Depths,
+) -> Transform:
+    """Return T_cam_obj with the highest sum of log beliefs at the corners, for a given centroid.
+
+    Args:
+        belief: Belief maps of the object.
+        centroid: (x, y) of the centroid's peak, input pixels.
+        cuboid: Keypoints of the part, object frame, metres.
+        K: Camera matrix of the network's input, pixels.
+        stride: Input pixels per cell of the maps.
+        depths: Range of the searched depths of the centroid, metres.
+    """
+    near, far = depths
+    tried = np.geomspace(near, far, math.ceil(math.log(far / near) / _STEP) + 1)
+    gains = np.log1p(np.maximum(belief[:NUM_CORNERS], 0.0) / _FLOOR)  # 0 without belief
+    rotations = _rotations()
+    arms = (cuboid[:NUM_CORNERS] - cuboid[CENTROID]) @ rotations.transpose(0, 2, 1)
+    ray = np.linalg.solve(K, np.array([*centroid, 1.0]))
+    number, rank = _search(np.asarray(gains, np.float32), arms, ray, tried, K, float(stride))
+    rotation = rotations[number]
+    return make_transform(rotation, tried[rank] * ray - rotation @ cuboid[CENTROID])
+
+
+def search_covariance(T_cam_obj: Transform, cuboid: Cuboid, focal_px: float, stride: int) -> Array:
+    """Return the covariance of a searched pose, as in ``Detection.covariance``."""
+    arm = T_cam_obj[:3, :3] @ cuboid[CENTROID]
+    centre: Vector = T_cam_obj[:3, 3] + arm
+    depth, along = float(centre[2]), centre / np.linalg.norm(centre)
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = ROTATION_DEVIATION**2 * np.eye(3)
+    covariance[3:, 3:] = (CENTROID_DEVIATION * stride * depth / focal_px) ** 2 * np.eye(3)
+    covariance[3:, 3:] += (DEPTH_DEVIATION * depth) ** 2 * np.outer(along, along)
+    # The centroid is certain, so the origin moves with the rotation about the centroid.
+    lever = np.array([[0, -arm[2], arm[1]], [arm[2], 0, -arm[0]], [-arm[1], arm[0], 0]])
+    moves = np.eye(6)
+    moves[3:, :3] = lever
+    return np.asarray(moves @ covariance @ moves.T)
+
+
+@cache
+def _rotations() -> Float[np.ndarray, "rotations 3 3"]:
+    """Return rotations that are spread evenly (super-Fibonacci sampling, Alexa, CVPR 2022)."""
+    step = np.arange(_NUM_ROTATIONS) + 0.5
+    share = step / _NUM_ROTATIONS
+    first, second = 2 * np.pi * step / math.sqrt(2), 2 * np.pi * step / 1.533751168755204288118041
+    small, large = np.sqrt(share), np.sqrt(1 - share)
+    parts = small * np.sin(first), small * np.cos(first), large * np.sin(second)
+    quaternions = np.stack([*parts, large * np.cos(second)], axis=1)
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix())
+
+
+@compiled()
+def _search(
+    gains: Array, arms: Array, ray: Array, depths: Array, K: Array, stride: float
+) -> tuple[int, int]:
+    """Return the indices of the rotation and of the depth with the highest sum over the corners.
+
+    ``arms[r, k]`` is the vector from the centroid to corner k under rotation r, metres.
+    """
+    rows, columns = gains.shape[1:]
+    half = (stride - 1) / 2
+    best, number, rank = -math.inf, 0, 0
+    for n in range(len(depths)):
+        x, y, z = depths[n] * ray[0], depths[n] * ray[1], depths[n] * ray[2]
+        for r in range(len(arms)):
+            total = 0.0
+            for k in range(arms.shape[1]):
+                depth = z + arms[r, k, 2]
+                if not depth > 0:
+                    continue
+                a, b = (x + arms[r, k, 0]) / depth, (y + arms[r, k, 1]) / depth
+                u = (K[0, 0] * a + K[0, 1] * b + K[0, 2] - half) / stride
+                v = (K[1, 1] * b + K[1, 2] - half) / stride
+                j, i = math.floor(u), math.floor(v)
+                if i < 0 or j < 0 or i >= rows - 1 or j >= columns - 1:
+                    continue
+                u, v = u - j, v - i
+                upper = (1 - u) * gains[k, i, j] + u * gains[k, i, j + 1]
+                lower = (1 - u) * gains[k, i + 1, j] + u * gains[k, i + 1, j + 1]
+                total += (1 - v) * upper + v * lower
+            if total > best:
+                best, number, rank = total, r, n
+    return number, rank
