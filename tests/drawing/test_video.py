@@ -1,7 +1,5 @@
 """Written videos: images at their times, and complete files after errors."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import cv2
@@ -12,14 +10,14 @@ from dopepp.core.errors import RunError
 from dopepp.drawing.pictures import VideoFile
 
 
-def frames(path) -> list[np.ndarray]:
+def frames(path):
     capture, result = cv2.VideoCapture(str(path)), []
     while (frame := capture.read())[0]:
         result.append(frame[1][..., ::-1])
     return result
 
 
-def level(number: int, size: tuple[int, int] = (48, 32)) -> np.ndarray:
+def level(number, size=(48, 32)):
     return np.full((*size[::-1], 3), 20 * number, np.uint8)
 
 
@@ -47,7 +45,7 @@ def test_odd_sides_are_complete(tmp_path, size):
 
 
 def test_a_video_is_complete_after_an_interruption(tmp_path):
-    def interrupted() -> None:
+    def interrupted():
         with VideoFile(tmp_path / "clip.mp4", 10) as video:
             for number in range(3):
                 video.write(level(number), number / 10)
