@@ -11,6 +11,7 @@ from dopepp.models.layers import find_activation
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import BACKBONES, HEADS, LOSSES
 
+MAPS = {"in_channels": 8, "num_objects": 1}
 WITH_WEIGHTS = {"weights_path": "vgg19.pth"}
 FULL_WIDTH = "with width=1 and batch_norm=false"
 
@@ -29,11 +30,7 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
         (VGG19, {"width": -1}, "width=-1"),
         (VGG19, {**WITH_WEIGHTS, "width": 0.5}, FULL_WIDTH),
         (VGG19, {**WITH_WEIGHTS, "batch_norm": True}, FULL_WIDTH),
-        (
-            VGG19,
-            {"weights_path": "no.pth"},
-            "which is not a file; allowed: a torchvision state_dict",
-        ),
+        (VGG19, {"weights_path": "no.pth"}, "is not a file; allowed: a torchvision state_dict"),
         (Pyramid, {"channels": (32, 96, 128)}, r"channels=.*; allowed: a list of 4 integers"),
         (Pyramid, {"channels": (32, 96, 4, 128)}, "a list of 4 integers from 8 to 1024"),
         (Pyramid, {"channels": (32, 96, 128, 10**9)}, "channels="),
@@ -68,13 +65,9 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
 )
 def test_arguments_are_bounded(kind, arguments, message):
     provided = {SE: {"channels": 8}, CBAM: {"channels": 8}}
-    provided |= {head: {"in_channels": 8, "num_objects": 1} for head in (Cascade, MultiScale)}
-    provided[SharedTrunk] = provided[Cascade]
+    provided |= dict.fromkeys((Cascade, MultiScale, SharedTrunk), MAPS)
     with pytest.raises(UserError, match=message):
-        kind(**{**provided.get(kind, {}), **arguments})
-
-
-MAPS = {"in_channels": 8, "num_objects": 1}
+        kind(**provided.get(kind, {}) | arguments)
 
 
 @pytest.mark.parametrize(
