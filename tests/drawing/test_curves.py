@@ -69,7 +69,7 @@ def test_empty_figures_are_drawn_and_pyplot_holds_no_figure():
     assert plt.get_fignums() == []
 
 
-def curve(*rates: float) -> RateCurve:
+def curve(*rates):
     rate = np.array(rates)
     return RateCurve(np.arange(len(rates), dtype=float), rate, rate * 0.9, rate * 0.9 + 0.1)
 

@@ -16,7 +16,7 @@ IMAGE = np.full((30, 40, 3), 100, np.uint8)
 RED, GREY = (200, 10, 10), (90, 90, 90)
 
 
-def line(values: np.ndarray, name: str = "dope", colour: str = "C0") -> curves.PlotLine:
+def line(values, name="dope", colour="C0"):
     return curves.PlotLine(name, np.arange(values.shape[1], dtype=float), values, colour)
 
 

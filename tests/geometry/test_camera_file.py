@@ -287,7 +287,7 @@ def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
     assert np.isfinite(camera.distortion).all()
 
 
-def pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
+def pixels(points, camera):
     lens = np.array(camera.distortion) if camera.distortion else None
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, lens)[0][:, 0]
 

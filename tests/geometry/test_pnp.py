@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 K = camera_matrix(600, 610, 207.5, 201.25)
 
 
-def box(x: float, y: float, z: float, centre: tuple[float, ...] = (0, 0, 0)) -> np.ndarray:
+def box(x, y, z, centre=(0, 0, 0)):
     half = np.array([x, y, z]) / 2
     return cuboid_keypoints(np.array(centre) - half, np.array(centre) + half)
 
@@ -51,7 +51,7 @@ def add(T, truth, cuboid):
     return float(error / np.linalg.norm(cuboid[0] - cuboid[6]))
 
 
-def isotropic(sigma: np.ndarray | float) -> np.ndarray:
+def isotropic(sigma):
     """Covariances of standard deviations in pixels."""
     with np.errstate(all="ignore"):
         return np.asarray(sigma)[..., None, None] ** 2 * np.eye(2)
@@ -151,7 +151,7 @@ def test_a_point_without_a_proper_covariance_is_missing(bad):
     assert_array_equal(result.inliers, np.arange(9) != 2)
 
 
-def opencv(cuboid: np.ndarray, pixels: np.ndarray, flag: int) -> np.ndarray | None:
+def opencv(cuboid, pixels, flag):
     result, vector, translation = cv2.solvePnP(cuboid, pixels, K, None, flags=flag)
     turn = rotation_vector_to_matrix(vector.ravel())
     return make_transform(turn, translation.ravel()) if result else None
@@ -289,7 +289,7 @@ def test_the_mirrored_start_avoids_the_wrong_tilt_of_plates():
         assert at_estimate <= at_truth
 
 
-def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
+def covariances(rng, n):
     """Return random covariances with standard deviations of 0.5 to 4 px."""
     angle, sigma = rng.uniform(0, np.pi, n), rng.uniform(0.5, 4, (n, 2))
     axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -47,7 +47,7 @@ def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion):
 
 @wide
 @given(AXES, st.sampled_from([0.0, 1e-12, 1e-6, 0.1, 2.0, 3.14]))
-def test_rotation_vectors_survive_a_round_trip(axis: list[float], angle: float) -> None:
+def test_rotation_vectors_survive_a_round_trip(axis, angle):
     vector = angle * np.array(axis) / np.linalg.norm(axis)
     result = matrix_to_rotation_vector(rotation_vector_to_matrix(vector))
     assert_allclose(result, vector, rtol=1e-9, atol=1e-14)

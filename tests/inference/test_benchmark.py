@@ -1,7 +1,5 @@
 """Time per frame with known delays; agreement of two estimators with known maps and detections."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass, field

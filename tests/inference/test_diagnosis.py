@@ -123,10 +123,7 @@ def test_detections_away_from_the_part_are_reported(estimator, factory, empty):
     assert not elsewhere(rendered.image, (u + 0.8 * half, v)).fix
     assert not elsewhere(rendered.image, (0.0, 0.0), (u, v)).fix
     beside = elsewhere(rendered.image, (u + 1.3 * half, v))
-    assert re.match(
-        r"1 of 1 detections above [\d.]+ are away from every part",
-        beside.sentence,
-    )
+    assert re.match(r"1 of 1 detections above [\d.]+ are away from every part", beside.sentence)
     named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)
     assert list(map(float, named.groups())) == pytest.approx([u, v], abs=3)
     assert "virtual.negative_photos" in beside.fix
@@ -177,7 +174,7 @@ def test_part_without_mesh_or_trained_sizes_is_diagnosed(factory):
         assert (findings["visibility"].fix == "") == (image is rendered.image)
 
 
-def shapes(noise: float = 0.0) -> np.ndarray:
+def shapes(noise=0.0):
     """Return a sharp image of large shapes."""
     image = np.full((240, 320, 3), 60, np.uint8)
     cv2.rectangle(image, (30, 40), (140, 190), (180, 170, 90), -1)

@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,7 +17,6 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.rotation import random_rotation, rotation_angle, rotation_vector_to_matrix
-from dopepp.inference import estimator as module
 from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps import MapGeometry, encode
 from dopepp.models.checkpoint import Checkpoint, write_atomic
@@ -41,7 +37,7 @@ def parts():
 
 @pytest.fixture(scope="session")
 def save(tiny_spec, tmp_path_factory):
-    def write(parts: list[Part], **recovery: float) -> Path:
+    def write(parts, **recovery):
         torch.manual_seed(0)
         spec = {**tiny_spec, "num_objects": 2}
         weights = build_network(spec).state_dict()
@@ -63,22 +59,20 @@ def estimator(checkpoint_path):
     return PoseEstimator.load(checkpoint_path)
 
 
-def image(width: int, height: int) -> np.ndarray:
+def image(width, height):
     return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
 class Oracle(PoseEstimator):
     """An estimator whose maps are computed from true poses instead of by a network."""
 
-    def show(
-        self, size: tuple[int, int], K: np.ndarray, poses: list[tuple[int, np.ndarray]]
-    ) -> None:
+    def show(self, size, K, poses):
         box = Letterbox.fit(size, self.checkpoint.input_size)
         self.truth = [
             (index, box.points(project_keypoints(self.cuboids[index], T, K))) for index, T in poses
         ]
 
-    def maps(self, image: np.ndarray) -> module.Maps:
+    def maps(self, image):
         assert image.shape[0] % self.network.size_multiple == 0
         assert image.shape[1] % self.network.size_multiple == 0
         belief, field = encode(
@@ -162,10 +156,10 @@ def test_poses_and_pixels_refer_to_the_given_image(checkpoint_path, size):
 
 
 def test_distorted_images_are_undistorted_first(estimator, monkeypatch):
-    inputs: list[np.ndarray] = []
+    inputs = []
     original = PoseEstimator.maps
 
-    def spy(self: PoseEstimator, pixels: np.ndarray) -> module.Maps:
+    def spy(self, pixels):
         inputs.append(pixels)
         return original(self, pixels)
 

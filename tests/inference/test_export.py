@@ -1,7 +1,5 @@
 """Exported networks: the same maps and poses as PyTorch's."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import replace
@@ -72,7 +70,7 @@ def exported(request, original, tmp_path_factory):
     return written(original, request.param, tmp_path_factory.mktemp("exported"))
 
 
-def random_images(*shape: int) -> torch.Tensor:
+def random_images(*shape):
     return torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))
 
 
@@ -197,7 +195,7 @@ def test_unsupported_operator_is_reported(layout, original, tmp_path, monkeypatc
     assert "\n" not in str(e.value)
 
 
-def _cubed(values: torch.Tensor) -> torch.Tensor:
+def _cubed(values):
     return values**3
 
 

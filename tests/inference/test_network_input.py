@@ -1,7 +1,5 @@
 """Sizes of the network's input, merging of their detections, and checks of depth images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The next best view, and its expected error compared with sampled poses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -32,13 +30,13 @@ def mesh():
     return make_outline_mesh(part.mesh.vertices, part.mesh.faces)
 
 
-def beside(degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> np.ndarray:
+def beside(degrees, axis=(0.0, 1.0, 0.0)):
     """Return T_world_cam of a camera rotated about the part by an angle."""
     turn = rotation_vector_to_matrix(math.radians(degrees) * np.array(axis))
     return invert_transform(make_transform(turn, POSE[:3, 3] - turn @ POSE[:3, 3]))
 
 
-def along_the_ray(millimetres: float) -> np.ndarray:
+def along_the_ray(millimetres):
     """Return the covariance of a pose with a large error along the viewing ray."""
     ray = POSE[:3, 3] / np.linalg.norm(POSE[:3, 3])
     covariance = np.diag(np.repeat([math.radians(0.2), 1e-4], 3) ** 2)

@@ -1,12 +1,8 @@
 """The page of ``dopepp serve`` in a browser."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -33,7 +29,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Path:
+def files(tmp_path_factory):
     """Folder with an image of the part, an empty image, a text file and a camera file."""
     folder = tmp_path_factory.mktemp("files")
     rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
@@ -45,11 +41,11 @@ def files(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def opened() -> Iterator[tuple[object, list[str]]]:
+def opened():
     """The open page, and the external addresses that it has requested."""
     from dopepp.inference.page import serve_page
 
-    elsewhere: list[str] = []
+    elsewhere = []
     estimator = PoseEstimator.load("pretrained/pivconnector")
     with serve_page(estimator) as address, sync_api.sync_playwright() as browsers:
         browser = browsers.chromium.launch(executable_path=CHROMIUM, args=FLAGS)

@@ -1,7 +1,5 @@
 """PoseResult: drawing, text, JSON and table."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -23,16 +21,16 @@ K = camera_matrix(560, 560, 319.5, 239.5)
 FRAME = "camera, OpenCV: x right, y down, z forward; metres"
 
 
-def detection(T: np.ndarray, score: float = 0.9) -> Detection:
+def detection(T, score=0.9):
     keypoints = project_keypoints(PART.cuboid, T, K)
     return Detection(PART.name, score, score, T, keypoints, keypoints, 0.5, np.eye(6) * 1e-6)
 
 
-def pose(x: float = 0.0, z: float = 0.3, turn: float = 0.5) -> np.ndarray:
+def pose(x=0.0, z=0.3, turn=0.5):
     return make_transform(Rotation.from_rotvec([turn, 0.3, 0.2]).as_matrix(), np.array([x, 0, z]))
 
 
-def result(*poses: np.ndarray, size: tuple[int, int] = (640, 480), **fields: object) -> PoseResult:
+def result(*poses, size=(640, 480), **fields):
     image = np.full((*size[::-1], 3), 128, np.uint8)
     speed = {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
     result = [detection(pose, 0.9 - 0.1 * number) for number, pose in enumerate(poses)]

@@ -1,7 +1,5 @@
 """Poses from several images of one static scene."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -23,7 +21,7 @@ SEED, SCENE = 4177, 0
 ANGLE = math.radians(25.0)
 
 
-def beside(target: np.ndarray, axis: tuple[float, float, float]) -> np.ndarray:
+def beside(target, axis):
     """Return T_new_cam of a camera that looks at a target from 25° beside it."""
     turn = rotation_vector_to_matrix(ANGLE * np.array(axis))
     return make_transform(turn, target[:3, 3] - turn @ target[:3, 3])
@@ -55,7 +53,7 @@ def views(scene, true):
     return images, [invert_transform(T) for T in poses]
 
 
-def errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float, float]:
+def errors(T, true):
     """Return degrees, and millimetres along and across the first camera's line of sight."""
     ray = true[:3, 3] / np.linalg.norm(true[:3, 3])
     shift = 1e3 * (T[:3, 3] - true[:3, 3])

@@ -1,7 +1,5 @@
 """``estimator.stream``: detections, tracks and times on images and videos."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

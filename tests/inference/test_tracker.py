@@ -10,12 +10,7 @@ from dopepp.geometry.camera import make_transform, move_pose, project_keypoints,
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.motion import PERSISTENCE, SUDDEN, Motion, at_rest
-from dopepp.inference.tracker import (
-    FORGOTTEN,
-    OFTEN,
-    PATIENCE,
-    PoseTracker,
-)
+from dopepp.inference.tracker import FORGOTTEN, OFTEN, PATIENCE, PoseTracker
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
 
@@ -262,7 +257,7 @@ START = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), [0
 NOISE = np.repeat([math.radians(0.5), 0.0005], 3)
 
 
-def filtered(motion: Motion, T: np.ndarray) -> Motion:
+def filtered(motion, T):
     """Update a prediction by a pose measured with NOISE, as refinement fuses the two."""
     prior, measured = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
     covariance = np.linalg.inv(prior + measured)
@@ -270,7 +265,7 @@ def filtered(motion: Motion, T: np.ndarray) -> Motion:
     return motion.update(move_pose(motion.T_cam_obj, step), covariance)
 
 
-def test_update_is_the_kalman_update() -> None:
+def test_update_is_the_kalman_update():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(12, 12)) * np.tile(NOISE, 2)[:, None]
     forecast = Motion(START, rng.normal(size=6) * 0.01, root @ root.T, np.zeros(6))
@@ -285,7 +280,7 @@ def test_update_is_the_kalman_update() -> None:
     assert_allclose(result.velocity, forecast.velocity + after[6:], atol=1e-9)
 
 
-def test_filter_predicts_a_steady_motion() -> None:
+def test_filter_predicts_a_steady_motion():
     step = np.array([0, math.radians(6), 0, 0.01, 0, 0])
     motion, T = at_rest(START, np.diag(NOISE**2), START[2, 3]), START
     for _ in range(15):
@@ -296,7 +291,7 @@ def test_filter_predicts_a_steady_motion() -> None:
     assert np.abs(miss[3:]).max() < 0.001
 
 
-def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
+def test_filter_reduces_the_jitter_of_a_part_at_rest():
     rng = np.random.default_rng(1)
     motion, steps = at_rest(START, np.diag(NOISE**2), START[2, 3]), []
     for _ in range(80):
@@ -309,7 +304,7 @@ def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
 
 
 @pytest.mark.parametrize("sudden", [False, True])
-def test_prediction_is_slower_and_less_certain(sudden: bool) -> None:
+def test_prediction_is_slower_and_less_certain(sudden):
     motion = at_rest(START, np.diag(NOISE**2), START[2, 3])
     motion = Motion(START, np.array([0, 0, 0.02, 0.003, 0, 0]), motion.covariance, np.zeros(6))
     later = motion.predict(START[2, 3], sudden)

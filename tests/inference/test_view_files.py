@@ -1,7 +1,5 @@
 """Files of camera poses in three formats, written here by independent code."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Contents of Rerun recordings, and errors of the viewer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tracking in the world through the images of several cameras, compared with single sets."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace

@@ -21,7 +21,7 @@ HALF = np.array([0.04, 0.03, 0.02])
 HALF_TURN = make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
 
-def part(**changes) -> Part:
+def part(**changes):
     corners = cuboid_keypoints(-HALF, HALF)
     made = Part("box", corners, 2 * float(np.linalg.norm(HALF)), corners[:8])
     return replace(made, **changes)
@@ -30,12 +30,12 @@ def part(**changes) -> Part:
 Pose = make_dataclass("Pose", ["object", "score", "T_cam_obj"])
 
 
-def pose(x=0.0, turn=0.0, z=0.5) -> np.ndarray:
+def pose(x=0.0, turn=0.0, z=0.5):
     rotation = Rotation.from_euler("z", turn, degrees=True).as_matrix()
     return make_transform(rotation, np.array([x, 0.0, z]))
 
 
-def truth(T, visible=1.0, wanted=None) -> Instance:
+def truth(T, visible=1.0, wanted=None):
     return Instance("box", T, np.zeros((9, 2)), visible, wanted=wanted)
 
 

@@ -13,13 +13,13 @@ from dopepp.parts.part import Part
 ABOUT_Z = np.array([0, 0, 1.0])
 
 
-def dumbbell(offset: float = 0.0) -> Part:
+def dumbbell(offset=0.0):
     """Two points ±5 cm from the centre: ADD is |Qp − p|, cos of its angle uniform in [−1, 1]."""
     points = np.array([[0.05, 0, 0], [-0.05, 0, 0]]) + offset
     return Part("dumbbell", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
 
 
-def plate() -> Part:
+def plate():
     points = np.random.default_rng(0).uniform(-1, 1, (800, 3)) * [0.0385, 0.0385, 0.0035]
     return Part("plate", cuboid_keypoints(points.min(0), points.max(0)), 0.109, points)
 

@@ -207,7 +207,7 @@ def test_an_inconsistent_file_is_refused_in_one_line(saved, edit, message):
 def test_a_failed_write_keeps_only_the_old_file(checkpoint, saved, monkeypatch, failing):
     before = saved.read_bytes()
 
-    def fail(*_: object) -> None:
+    def fail(*_):
         raise OSError("no space left on device")
 
     monkeypatch.setattr(storage.torch if failing == "save" else storage.os, failing, fail)

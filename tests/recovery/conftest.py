@@ -1,11 +1,6 @@
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
@@ -16,19 +11,17 @@ from dopepp.maps import MapGeometry, encode
 class Scene:
     """Poses of objects, and their perfect maps."""
 
-    def __init__(
-        self, cuboids: Sequence[np.ndarray], K: np.ndarray, cells: tuple[int, int] = (52, 52)
-    ) -> None:
+    def __init__(self, cuboids, K, cells=(52, 52)):
         self.cuboids, self.K, self.cells = np.stack(cuboids), K, cells
-        self.objects: list[int] = []
-        self.poses: list[np.ndarray] = []
+        self.objects = []
+        self.poses = []
 
-    def place(self, index: int, T_cam_obj: np.ndarray) -> Scene:
+    def place(self, index, T_cam_obj):
         self.objects.append(index)
         self.poses.append(T_cam_obj)
         return self
 
-    def maps(self, sigma: float = 1.0) -> tuple[Tensor, Tensor]:
+    def maps(self, sigma=1.0):
         points = [
             project_keypoints(self.cuboids[c], T, self.K)
             for c, T in zip(self.objects, self.poses, strict=True)
@@ -42,7 +35,7 @@ class Scene:
         )
         return belief[0], field[0]
 
-    def errors(self, index: int, T_cam_obj: np.ndarray) -> list[float]:
+    def errors(self, index, T_cam_obj):
         """Return the ADD between a pose and each instance of an object, diameters of the cuboid."""
         cuboid = self.cuboids[index]
         moved = transform(T_cam_obj, cuboid)
@@ -53,7 +46,7 @@ class Scene:
             if c == index
         ]
 
-    def error(self, index: int, T_cam_obj: np.ndarray) -> float:
+    def error(self, index, T_cam_obj):
         """Return the ADD between a pose and the nearest instance, diameters of the cuboid."""
         return min(self.errors(index, T_cam_obj))
 
@@ -76,9 +69,7 @@ def plate():
 
 @pytest.fixture
 def pose():
-    def draw(
-        rng: np.random.Generator, x: float = 0.0, y: float = 0.0, z: float = 0.4
-    ) -> np.ndarray:
+    def draw(rng, x=0.0, y=0.0, z=0.4):
         """Return a random rotation at a position (metres), shifted by up to a centimetre."""
         return make_transform(
             random_rotation(rng), rng.uniform(-0.01, 0.01, 3) + np.array([x, y, z])
@@ -89,7 +80,7 @@ def pose():
 
 @pytest.fixture
 def make_scene(K):
-    def make(*cuboids: np.ndarray, camera: np.ndarray = K) -> Scene:
+    def make(*cuboids, camera=K):
         return Scene(cuboids, camera)
 
     return make

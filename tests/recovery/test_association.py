@@ -21,9 +21,7 @@ from dopepp.recovery.association import (
 WIDE = math.radians(45)
 
 
-def peaks(
-    corners: np.ndarray, toward: np.ndarray, centroids: object, score: object = 1.0
-) -> ObjectPeaks:
+def peaks(corners, toward, centroids, score=1.0):
     """Return peaks at known positions, (8, n, 2); NaN for missing peaks."""
     centroid = np.array(centroids, float).reshape(-1, 2)
     is_present = np.isfinite(corners[..., 0])
@@ -39,17 +37,17 @@ def peaks(
     )
 
 
-def one_corner(position: object, toward: object, centroids: object, score: object = 1.0):
+def one_corner(position, toward, centroids, score=1.0):
     corners, vectors = np.full((2, 8, len(np.array(position)), 2), np.nan)
     corners[0], vectors[0] = position, toward
     return peaks(corners, vectors, centroids, score)
 
 
-def group(peaks: ObjectPeaks, max_angle: float = WIDE, coincident_px: float = 8.0):
+def group(peaks, max_angle=WIDE, coincident_px=8.0):
     return associate(peaks, direction_evidence(peaks, max_angle, coincident_px))
 
 
-def crowd(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+def crowd(rng, count):
     """Return affine projections of cuboids: corners (8, n, 2) and centroids (n, 2)."""
     centroids = rng.uniform(0, 400, (count, 2))
     affine = rng.normal(scale=25, size=(count, 2, 3))
@@ -144,7 +142,7 @@ def test_no_instance_without_a_centroid():
     assert group(one_corner([[1, 1]], [[1, 0]], np.zeros((0, 2)))) == []
 
 
-def error(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
+def error(T, truth, cuboid):
     if T is None:
         return np.inf
     return float(np.linalg.norm(transform(T, cuboid) - transform(truth, cuboid), axis=1).mean())

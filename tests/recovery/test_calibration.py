@@ -33,7 +33,7 @@ CUBOID = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03,
 T = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), np.array([0.02, 0, 0.6]))
 
 
-def detection(**changes: object) -> Detection:
+def detection(**changes):
     keypoints, covariance = project(transform(T, CUBOID), K), np.diag([1e-4] * 3 + [1e-6] * 3)
     return replace(
         Detection("box", 0.5, 0.5, T, keypoints, keypoints.copy(), 1.0, covariance), **changes
@@ -221,7 +221,7 @@ def test_the_fit_is_the_maximum_of_the_likelihood():
     truth = np.array([0.5, 1.5, -1.0, 0.0, 0.3])
     correct = rng.random(400) < score(features, truth)
 
-    def loss(weights: np.ndarray) -> float:
+    def loss(weights):
         log_odds = features @ weights
         return float(
             np.logaddexp(0, log_odds).sum()

@@ -3,7 +3,6 @@
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -145,8 +144,8 @@ def test_the_remaining_time_is_of_the_whole_run(monkeypatch):
     monkeypatch.setattr(TQDMProgressBar, "get_metrics", lambda *_: {"train/loss": 1.0})
     now = [100.0]
     monkeypatch.setattr(throughput.time, "monotonic", lambda: now[0])
-    trainer: Any = SimpleNamespace(global_step=50, estimated_stepping_batches=250)
-    bar: Any = throughput.RunProgress()
+    trainer = SimpleNamespace(global_step=50, estimated_stepping_batches=250)
+    bar = throughput.RunProgress()
     bar.on_train_start(trainer, None)
     assert "left" not in bar.get_metrics(trainer, None)
     # A run resumed at step 50 took a minute for 20 steps, so 180 steps take 9 minutes.
@@ -157,7 +156,7 @@ def test_the_remaining_time_is_of_the_whole_run(monkeypatch):
 
 
 def test_the_simple_profiler_lists_the_slowest_hooks(tmp_path):
-    profiler: Any = make_profiler("simple", tmp_path)
+    profiler = make_profiler("simple", tmp_path)
     profiler.recorded_durations = {"step": [0.25, 0.75], "save": [0.125], "rest": [0.0]}
     assert profile_rows(profiler, limit=2) == [
         {"what": "step", "calls": "2", "s": "1.000", "ms/call": "500.00"},

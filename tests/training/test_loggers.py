@@ -30,7 +30,7 @@ def test_a_failing_write_keeps_the_old_file_and_the_rows(tmp_path, monkeypatch, 
     before = table.path.read_bytes()
     table.log_metrics({"loss": 1.0}, step=1)
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:

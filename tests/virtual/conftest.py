@@ -14,7 +14,7 @@ from dopepp.virtual import Ambient, Light, Scene, make_surface
 LAMP = Light((0.2, -0.4, -0.2))
 
 
-def mesh_of(solid: trimesh.Trimesh) -> Mesh:
+def mesh_of(solid):
     return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
 
 

@@ -2,7 +2,6 @@ import importlib.util
 import logging
 import os
 import pickle
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from dopepp.virtual.backgrounds import (
 from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
 
 
-def write_photos(folder: Path, count: int, side: int = 40) -> None:
+def write_photos(folder, count, side=40):
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     for number in range(count):
@@ -30,7 +29,7 @@ def write_photos(folder: Path, count: int, side: int = 40) -> None:
         assert cv2.imwrite(str(folder / f"{number:04}.jpg"), cv2.GaussianBlur(noise, (9, 9), 3))
 
 
-def draw(backgrounds: PhotoBackgrounds, seed: int) -> np.ndarray:
+def draw(backgrounds, seed):
     return backgrounds.draw(np.random.default_rng(seed), 32, 24)
 
 
@@ -211,7 +210,7 @@ class Grey:
         return ["grey"]
 
 
-def covered(number: int, seed: int, size=(96, 64)) -> float:
+def covered(number, seed, size=(96, 64)):
     clutter = ClutteredBackgrounds(Grey(), (number, number))
     image = clutter.draw(np.random.default_rng(seed), *size)
     assert (image.shape, image.dtype) == ((size[1], size[0], 3), np.uint8)

@@ -9,7 +9,7 @@ import dopepp.core.errors
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, transform
 from dopepp.virtual import Factory, heap, visible_fractions
-from dopepp.virtual.presets import Preset, preset_of
+from dopepp.virtual.presets import preset_of
 from dopepp.virtual.presets.table import Pile
 from dopepp.virtual.renderers import find_renderer
 
@@ -17,7 +17,7 @@ BOX = np.array([0.10, 0.06, 0.02])  # sides of ``box_part``
 DIAMETER = float(np.linalg.norm(BOX))
 
 
-def small(**changes: object) -> Preset:
+def small(**changes):
     fewer = {"targets_per_image": [5, 9], "distractors": {"number": [0, 0]}}
     return preset_of("heap", {**fewer, **changes}).resized(160, 120)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Mesh
-from dopepp.virtual import Rendered, make_surface, render, silhouette, visible_fractions
+from dopepp.virtual import make_surface, render, silhouette, visible_fractions
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Plane, Scene, SceneObject
 
 pytestmark = pytest.mark.usefixtures("quick_sky")
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_sky")
 FLOOR = Plane((0.0, -1.0, 0.0), -0.3)
 
 
-def check(scene: Scene) -> Rendered:
+def check(scene):
     for plane in (None, FLOOR):
         rendered = render(replace(scene, plane=plane))
         assert np.isfinite(rendered.depth).all()

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from dopepp.virtual.backgrounds import (
 SPLITS = ("train", "val", "test")
 
 
-def write_numbers(folder: Path, numbers: range) -> PhotoBackgrounds:
+def write_numbers(folder, numbers):
     """Write files that differ; the division does not decode them."""
     folder.mkdir(exist_ok=True)
     for number in numbers:
@@ -27,7 +26,7 @@ def write_numbers(folder: Path, numbers: range) -> PhotoBackgrounds:
     return PhotoBackgrounds(folder)
 
 
-def contents(photos: PhotoBackgrounds) -> list[list[bytes]]:
+def contents(photos):
     return [sorted(path.read_bytes() for path in photos.part(split).paths) for split in SPLITS]
 
 

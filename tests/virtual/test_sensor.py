@@ -54,7 +54,7 @@ def test_capture_is_pure_and_keeps_the_shape(
     assert (first.dtype, first.shape) == (np.uint8, image.shape)
 
 
-def linear(codes: np.ndarray) -> np.ndarray:
+def linear(codes):
     share = codes / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 

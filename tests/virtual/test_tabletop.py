@@ -10,8 +10,8 @@ import trimesh
 from dopepp.geometry.camera import transform
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import make_part
-from dopepp.virtual import Distractors, Factory, Scene, SceneObject
-from dopepp.virtual.presets import PRESETS, Preset, preset_of
+from dopepp.virtual import Distractors, Factory
+from dopepp.virtual.presets import PRESETS, preset_of
 from dopepp.virtual.tabletop import HeightMap
 
 NUM_SCENES = 25
@@ -21,24 +21,24 @@ CONTACT = 1e-4
 class Constant:
     """Backgrounds of one grey level after another."""
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    def draw(self, rng, width, height):
         return np.full((height, width, 3), rng.integers(1, 255), np.uint8)
 
 
 class Ramp:
     """An image whose red is its column and whose green is its row, over 256 px."""
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    def draw(self, rng, width, height):
         ramp = np.zeros((height, width, 3), np.uint8)
         ramp[..., 0], ramp[..., 1] = np.arange(width), np.arange(height)[:, None]
         return ramp
 
 
-def small(name: str, **changes: object) -> Preset:
+def small(name, **changes):
     return preset_of(name, changes).resized(160, 120)
 
 
-def heights(scene: Scene, item: SceneObject) -> np.ndarray:
+def heights(scene, item):
     """Heights of an object's vertices above the plane, metres."""
     points = transform(item.T_cam_obj, item.surface.vertices)
     return np.asarray(points @ np.array(scene.plane.normal) - scene.plane.offset)
@@ -86,7 +86,7 @@ def test_heaps_stand_on_the_plane(heaps):
     assert max(counts) >= 8
 
 
-def solid(item: SceneObject) -> manifold3d.Manifold:
+def solid(item):
     vertices = transform(item.T_cam_obj, item.surface.vertices)
     merged, index = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
     mesh = manifold3d.Mesh64(merged, index.reshape(-1)[item.surface.faces].astype(np.uint64))

@@ -1,10 +1,5 @@
 """Images and cameras of ROS recordings that ``rosbags`` wrote."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import cv2
 import numpy as np
 import pytest
@@ -25,25 +20,25 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 class Recording:
     """Messages of ROS 1 or 2 on topics, written to a file or folder."""
 
-    def __init__(self, kind: str, folder: Path) -> None:
+    def __init__(self, kind, folder):
         self._is_ros1 = kind == "bag"
         self.path = folder / {"bag": "run.bag"}.get(kind, "run")
         self._store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
         plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        self._writer: Any = (
+        self._writer = (
             rosbag1.Writer(self.path) if self._is_ros1
             else rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
         )  # fmt: skip
-        self._topics: dict[str, Any] = {}
+        self._topics = {}
 
-    def __enter__(self) -> Recording:
+    def __enter__(self):
         self._writer.open()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._writer.close()
 
-    def write(self, topic: str, kind: str, second: int, **fields: Any) -> None:
+    def write(self, topic, kind, second, **fields):
         name, types = f"sensor_msgs/msg/{kind}", self._store.types
         stamp = types["builtin_interfaces/msg/Time"](second, 500_000_000)
         counted = {"seq": second} if self._is_ros1 else {}
@@ -54,14 +49,14 @@ class Recording:
         encode = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         self._writer.write(self._topics[topic], second * 10**9, encode(message, name))
 
-    def image(self, topic: str, encoding: str, data: np.ndarray, second: int = 1) -> None:
+    def image(self, topic, encoding, data, second=1):
         rows = np.pad(data.reshape(len(data), -1), ((0, 0), (0, 3)))  # rows may be padded
         self.write(
             topic, "Image", second, height=data.shape[0], width=data.shape[1], encoding=encoding,
             is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
         )  # fmt: skip
 
-    def camera(self, topic: str, **changes: Any) -> None:
+    def camera(self, topic, **changes):
         large = {"k": K, "d": LENS, "p": P, "r": np.eye(3).ravel().tolist()}
         names = {name: name.upper() if self._is_ros1 else name for name in large}
         roi = self._store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
@@ -115,7 +110,7 @@ def test_every_encoding_is_converted_to_rgb(encoding, tmp_path):
     assert (source.camera is not None) == (encoding in ("png", "jpeg"))
 
 
-def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def coded_as(encoding, rgb):
     """Return encoded pixels, the expected image, and the tolerated mean error of a decoder."""
     if encoding == "mono8":
         grey = rgb[..., 1]

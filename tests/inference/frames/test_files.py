@@ -1,7 +1,5 @@
 """Frames of images, folders, patterns and videos, and errors about unreadable sources."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,7 @@ from dopepp.core.errors import UserError
 from dopepp.inference.frames import open_sources
 
 
-def grey(level: int, size: tuple[int, int] = (32, 24)) -> np.ndarray:
+def grey(level, size=(32, 24)):
     return np.full((*size[::-1], 3), level, np.uint8)
 
 
@@ -35,7 +33,7 @@ def clip(tmp_path):
     return path
 
 
-def levels(*given: object, stride: int = 1) -> list[int]:
+def levels(*given, stride=1):
     frames = [frame for source in open_sources(given) for frame in source.frames(stride)]
     return [round(float(frame.image.mean()) / 20) for frame in frames]
 

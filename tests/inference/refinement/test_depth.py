@@ -21,7 +21,7 @@ from dopepp.inference.refinement.part_surface import (
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.inference.refinement.solver import make_prior
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers.raster import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
@@ -34,12 +34,12 @@ BLACK = np.zeros((480, 640, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
-def box() -> Part:
+def box():
     whole = trimesh.creation.box((0.164, 0.214, 0.072))
     return make_part("box", Mesh(np.array(whole.vertices), np.array(whole.faces, np.int32)))
 
 
-def seen(part: Part, T: np.ndarray, wall: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+def seen(part, T, wall=0.9):
     """Return image and noisy depth of a part before a wall."""
     body = make_body(part, is_target=True)
     objects, plane = (SceneObject(body.surface, T, part=part),), Plane((0.0, 0.0, -1.0), -wall)
@@ -49,11 +49,11 @@ def seen(part: Part, T: np.ndarray, wall: float = 0.9) -> tuple[np.ndarray, np.n
     return rendered.image, (depth + 1e-3 * noise * (depth > 0)).astype(np.float32)
 
 
-def depth_of(part: Part, T: np.ndarray) -> np.ndarray:
+def depth_of(part, T):
     return seen(part, T)[1]
 
 
-def started(T: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def started(T, rng):
     shift = rng.normal(size=3) * [0.25, 0.25, 1.0]
     shift *= 0.014 / np.linalg.norm(shift)
     axis = rng.normal(size=3)
@@ -61,7 +61,7 @@ def started(T: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return make_transform(rotation_vector_to_matrix(axis) @ T[:3, :3], T[:3, 3] + shift)
 
 
-def add(part: Part, one: np.ndarray, other: np.ndarray) -> float:
+def add(part, one, other):
     points = transform(one, part.points) - transform(other, part.points)
     return float(np.linalg.norm(points, axis=1).mean())
 

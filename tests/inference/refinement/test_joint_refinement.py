@@ -1,7 +1,5 @@
 """The joint solver against least squares of SciPy, on keypoints instead of outlines."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -33,7 +31,7 @@ BLANK = np.zeros((4, 4, 3), np.uint8)
 class Keypoints:
     """Points of a part that a camera has measured."""
 
-    def __init__(self, pixels: np.ndarray) -> None:
+    def __init__(self, pixels):
         self.pixels = pixels
 
     def __call__(self, pose, prior):
@@ -47,7 +45,7 @@ class Keypoints:
         return rows.T @ rows, rows.T @ rest
 
 
-def scene(seed: int, error: np.ndarray, num_views: int = 2):
+def scene(seed, error, num_views=2):
     """Return the true pose in the world, the views and their measured keypoints."""
     rng = np.random.default_rng(seed)
     true = make_transform(random_rotation(rng), rng.normal(size=3))

@@ -7,19 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from dopepp.geometry.camera import (
-    Transform,
-    camera_matrix,
-    make_transform,
-    move_pose,
-    project,
-    transform,
-)
+from dopepp.geometry.camera import camera_matrix, make_transform, move_pose, project, transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.inference.refinement.verification import EVIDENCE, Verifier, learned_model
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import Mesh, make_part
 from dopepp.recovery.detection import Detection
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import preset_of
@@ -29,7 +22,7 @@ POSE = make_transform(rotation_vector_to_matrix(np.array([2.4, 0.5, 0.4])), np.a
 COVARIANCE = np.diag(np.repeat([math.radians(2.0), 0.002], 3) ** 2)
 
 
-def wedge() -> Part:
+def wedge():
     """A part without symmetries: two boxes and a rod."""
     pieces = [trimesh.creation.box((0.08, 0.05, 0.02)), trimesh.creation.box((0.02, 0.05, 0.06))]
     pieces.append(trimesh.creation.cylinder(0.008, 0.05))
@@ -43,7 +36,7 @@ PART = wedge()
 
 
 @pytest.fixture(scope="module")
-def rendered() -> tuple[np.ndarray, np.ndarray, Transform]:
+def rendered():
     """Return a render of the part, its camera matrix and its pose."""
     fields = {
         "width": 320, "height": 240, "turning": {"kind": "free"}, "distractors": {"number": [0, 0]},
@@ -55,7 +48,7 @@ def rendered() -> tuple[np.ndarray, np.ndarray, Transform]:
     return picture.image, scene.K, scene.objects[scene.targets[0]].T_cam_obj
 
 
-def evidence(image: np.ndarray, K: np.ndarray, T: Transform, part: Part = PART) -> dict[str, float]:
+def evidence(image, K, T, part=PART):
     """Return the evidence about a pose by name."""
     assert part.mesh is not None
     verifier = Verifier(make_outline_mesh(part.mesh.vertices, part.mesh.faces), part.diameter)
@@ -65,7 +58,7 @@ def evidence(image: np.ndarray, K: np.ndarray, T: Transform, part: Part = PART) 
     return dict(zip(EVIDENCE, values, strict=True))
 
 
-def drawn_box(shade: tuple[int, int, int]) -> np.ndarray:
+def drawn_box(shade):
     """Return an image of a cube in one colour on black, drawn by ray casting."""
     v, u = np.mgrid[:240, :320].reshape(2, -1)
     rays = np.column_stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)])
@@ -75,7 +68,7 @@ def drawn_box(shade: tuple[int, int, int]) -> np.ndarray:
     return np.where(hits[..., None], np.array(shade, np.uint8), 0).astype(np.uint8)
 
 
-def box_part() -> Part:
+def box_part():
     box = trimesh.creation.box((0.06, 0.06, 0.06))
     return make_part("box", Mesh(np.asarray(box.vertices), box.faces.astype(np.int32)))
 

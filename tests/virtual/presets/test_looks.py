@@ -20,11 +20,11 @@ from dopepp.virtual import (
 from dopepp.virtual.presets.looks import black_body_rgb
 
 
-def planck_rgb(temperature: float) -> np.ndarray:
+def planck_rgb(temperature):
     """Integrate Planck's law over Wyman, Sloan and Shirley's fits of the CIE 1931 observer."""
     nm = np.arange(380.0, 781.0)
 
-    def lobe(height: float, centre: float, left: float, right: float) -> np.ndarray:
+    def lobe(height, centre, left, right):
         scaled = (nm - centre) * np.where(nm < centre, left, right)
         return height * np.exp(-0.5 * scaled**2)
 

@@ -11,8 +11,7 @@ from scipy.stats import kstest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import is_rotation, random_rotation
-from dopepp.parts.part import Part
-from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, Table, visible_fractions
+from dopepp.virtual import PRESETS, Distractors, Factory, Table, visible_fractions
 from dopepp.virtual.presets import preset_of, resolve_base
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
@@ -24,7 +23,7 @@ from dopepp.virtual.presets.placement import (
 )
 
 
-def scenes(preset: Preset, parts: list[Part], count: int = 200) -> list[Scene]:
+def scenes(preset, parts, count=200):
     small = preset.resized(max(preset.width // 8, 32), max(preset.height // 8, 24))
     factory = Factory(parts, small, seed=5)
     return [factory.scene(0, index) for index in range(count)]
@@ -36,7 +35,7 @@ def quickstart_scenes(parts):
     return [factory.scene(0, index) for index in range(200)]
 
 
-def angles(rotation: np.ndarray) -> tuple[float, float]:
+def angles(rotation):
     """(in-plane, tilt) in degrees, from the rotation alone.
 
     The tilt rotates about an axis in the image plane, so the twist about the optical axis of

@@ -21,11 +21,11 @@ FOCAL = 640 / math.tan(math.radians(69 / 2))
 K = camera_matrix(FOCAL, FOCAL, 650.0, 350.0)
 
 
-def view(near: float = 0.4, far: float = 0.7, **changes: object) -> View:
+def view(near=0.4, far=0.7, **changes):
     return replace(View((1280, 720), K, (near, far), "cam.yaml"), **changes)
 
 
-def part(diameter: float):
+def part(diameter):
     return replace(pivconnector(), name="bracket", diameter=diameter)
 
 

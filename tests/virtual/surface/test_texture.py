@@ -7,7 +7,7 @@ import pytest
 
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.virtual import Ambient, Material, Scene, SceneObject, make_surface, render
+from dopepp.virtual import Ambient, Material, SceneObject, make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.sensor import decode_srgb, encode_srgb
 from dopepp.virtual.surface.texture import make_texture
@@ -16,7 +16,7 @@ SIDE = 0.3
 DIM = Ambient(above=(0.4, 0.4, 0.4), below=(0.4, 0.4, 0.4))
 
 
-def supersampled(texture: np.ndarray, pose: np.ndarray, scene: Scene, n: int = 12) -> np.ndarray:
+def supersampled(texture, pose, scene, n=12):
     """Mean linear texel under n×n rays a pixel; NaN where some of them miss the sheet."""
     width, height = scene.size
     v, u = np.mgrid[:height, :width]

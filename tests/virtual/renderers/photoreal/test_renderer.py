@@ -14,10 +14,10 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import Mesh, Part
-from dopepp.virtual import PRESETS, Factory, Rendered, make_surface, render
+from dopepp.parts.part import Mesh
+from dopepp.virtual import PRESETS, Factory, make_surface, render
 from dopepp.virtual.renderers import find_renderer
-from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, Plane, Scene, SceneObject
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, Plane, SceneObject
 
 pytestmark = pytest.mark.render
 
@@ -29,19 +29,19 @@ def photoreal():
     return find_renderer("photoreal")
 
 
-def lying(part: Part, height: float, **options: Material) -> SceneObject:
+def lying(part, height, **options):
     """Place a part's frame above the plane that :func:`on_table` adds, half a metre away."""
     T = np.eye(4)
     T[:3, 3] = 0.0, 0.0, 0.5 - height
     return SceneObject(make_surface(part.mesh), T, part=part, **options)
 
 
-def on_table(scene: Scene) -> Scene:
+def on_table(scene):
     """Look straight down on a plane at half a metre."""
     return replace(scene, plane=Plane((0.0, 0.0, -1.0), -0.5))
 
 
-def assert_same_labels(result: Rendered, expected: Rendered) -> None:
+def assert_same_labels(result, expected):
     assert (np.abs(result.depth - expected.depth) < 1e-3).mean() >= 0.99
     assert (result.instances == expected.instances).mean() >= 0.99
     np.testing.assert_array_equal(result.visible_fractions, expected.visible_fractions)

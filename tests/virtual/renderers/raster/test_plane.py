@@ -9,7 +9,7 @@ import trimesh
 from dopepp.geometry.camera import make_transform, project
 from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface, render, visible_fractions
-from dopepp.virtual.scene import Ambient, Light, Plane, Rendered, Scene, SceneObject
+from dopepp.virtual.scene import Ambient, Light, Plane, SceneObject
 
 ANGLE = 0.7
 NORMAL = np.array([0.0, -np.sin(ANGLE), -np.cos(ANGLE)])
@@ -20,13 +20,13 @@ IMAGE = {"size": (320, 240), "focal": 320.0}
 DARK = Ambient(above=(0, 0, 0), below=(0, 0, 0))
 
 
-def on_plane(x: float, y: float, height: float) -> np.ndarray:
+def on_plane(x, y, height):
     """A point in the camera frame, from plane coordinates around its middle."""
     side = np.array([1.0, 0, 0])
     return np.array([0, 0, 0.5]) + x * side + y * np.cross(NORMAL, side) + height * NORMAL
 
 
-def box_at(x: float, y: float, height: float, extents: tuple[float, float, float]) -> SceneObject:
+def box_at(x, y, height, extents):
     """A box whose bottom hovers over the plane."""
     box = trimesh.creation.box(extents)
     side = np.array([1.0, 0, 0])
@@ -35,11 +35,11 @@ def box_at(x: float, y: float, height: float, extents: tuple[float, float, float
     return SceneObject(surface, make_transform(rotation, on_plane(x, y, height + extents[2] / 2)))
 
 
-def drawn(scene: Scene) -> Rendered:
+def drawn(scene):
     return render(replace(scene, plane=PLANE))
 
 
-def brightness(rendered: Rendered, point: np.ndarray) -> float:
+def brightness(rendered, point):
     u, v = np.round(project(point, rendered.scene.K)).astype(int)
     assert rendered.instances[v, u] == -1
     return float(rendered.image[v, u, 1])

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from dopepp.parts.part import Mesh
 from dopepp.virtual import Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.renderers.raster import visibility as shadow_module
-from dopepp.virtual.renderers.raster.visibility import ShadowMap, shadow_map
+from dopepp.virtual.renderers.raster.visibility import shadow_map
 from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
 
 MakeScene = Callable[..., Scene]
@@ -28,11 +27,11 @@ MakeSurface = Callable[[trimesh.Trimesh], Surface]
 LARGE = {"size": (640, 480), "focal": 600.0}
 
 
-def at(surface: Surface, x: float, y: float, z: float) -> SceneObject:
+def at(surface, x, y, z):
     return SceneObject(surface, make_transform(np.eye(3), np.array([x, y, z])))
 
 
-def cast_rays(scene: Scene) -> np.ndarray:
+def cast_rays(scene):
     """Depth at every pixel centre by Möller–Trumbore over all triangles; inf for no hit."""
     width, height = scene.size
     v, u = np.mgrid[:height, :width].reshape(2, -1)
@@ -155,7 +154,7 @@ def test_edges_are_anti_aliased_by_coverage(scene_of, sheet):
     assert (rendered.instances[60, 80], rendered.instances[60, 81]) == (-1, 0)
 
 
-def middle_depth(path: Path, scene_of: MakeScene, turn: np.ndarray) -> float:
+def middle_depth(path, scene_of, turn):
     mesh = load_part(path, "mm").mesh
     pose = make_transform(turn, np.array([0.0, 0.0, 0.4]))
     return float(render(scene_of(SceneObject(make_surface(mesh), pose))).depth[60, 80])
@@ -222,7 +221,7 @@ def test_a_huge_silhouette_is_counted_at_a_reduced_scale(scene_of, plate):
     assert fraction == pytest.approx(640 * 480 / area, rel=0.01)
 
 
-def without_casters(*arguments: object) -> ShadowMap:
+def without_casters(*arguments):
     """A shadow map that nothing was drawn into."""
     drawn = shadow_map(*arguments)
     return replace(drawn, inverse_depth=np.zeros_like(drawn.inverse_depth))

@@ -9,21 +9,21 @@ import trimesh
 
 from dopepp.geometry.camera import make_transform, resize_camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.virtual import Surface, make_surface, render
+from dopepp.virtual import make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, SceneObject
 from dopepp.virtual.sensor import decode_srgb
 
 
-def even(light: float) -> Ambient:
+def even(light):
     return Ambient(above=(light,) * 3, below=(light,) * 3)
 
 
-def linear(codes: np.ndarray) -> np.ndarray:
+def linear(codes):
     return np.asarray(decode_srgb(np.asarray(codes) / 255))
 
 
-def facing(surface: Surface, place: tuple[float, float, float], *material: Material) -> SceneObject:
+def facing(surface, place, *material):
     return SceneObject(surface, make_transform(FACING, np.array(place)), *material)
 
 
