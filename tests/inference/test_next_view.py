@@ -6,22 +6,15 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import (
-    camera_matrix,
-    invert_transform,
-    make_transform,
-    move_pose,
-    transform,
-)
+from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform, move_pose
+from dopepp.geometry.camera import transform as moved
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.several_views.next_view import next_best_view, point_error
 from dopepp.parts.catalogue import pivconnector
 
 K, SIZE = camera_matrix(600.0, 600.0, 319.5, 239.5), (640, 480)
-POSE = make_transform(
-    rotation_vector_to_matrix(np.array([2.9, 0.2, 0.3])), np.array([0.01, 0, 0.25])
-)
+POSE = move_pose(np.eye(4), np.array([2.9, 0.2, 0.3, 0.01, 0, 0.25]))
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +70,7 @@ def test_point_error_is_the_rms_error_of_sampled_poses(mesh):
     spread = rng.normal(size=(6, 6)) * np.repeat([0.01, 0.001], 3)[:, None]
     covariance, pose = spread @ spread.T, make_transform(random_rotation(rng), rng.normal(size=3))
     draws = [move_pose(pose, spread @ rng.normal(size=6)) for _ in range(4000)]
-    at = transform(pose, mesh.vertices)
-    squares = [((transform(draw, mesh.vertices) - at) ** 2).sum(axis=1).mean() for draw in draws]
-    assert point_error(mesh, pose, covariance) == pytest.approx(
-        math.sqrt(np.mean(squares)), rel=0.05
-    )
+    at = moved(pose, mesh.vertices)
+    squares = [((moved(draw, mesh.vertices) - at) ** 2).sum(axis=1).mean() for draw in draws]
+    expected = math.sqrt(np.mean(squares))
+    assert point_error(mesh, pose, covariance) == pytest.approx(expected, rel=0.05)

@@ -16,6 +16,7 @@ from dopepp.recovery.detection import Detection
 
 K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
 IMAGE = np.zeros((480, 640, 3), np.uint8)
+PART = pivconnector()
 
 
 class Stage:
@@ -33,9 +34,8 @@ class Stage:
         self.agreement = self.network_agreement = 0.95
         self.min_score = 0.5
 
-    def put(self, name, part, position, turn=(0.0, 0.0, 0.0)):
-        pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(position))
-        self.actors[name] = part.name, pose
+    def put(self, name, position, turn=(0.0, 0.0, 0.0), part=PART):
+        self.actors[name] = part.name, move_pose(np.eye(4), np.array([*turn, *position]))
 
     def split(self, candidates):
         return PoseEstimator.split(self, candidates)
@@ -78,7 +78,7 @@ def stage():
 @pytest.fixture
 def tracker(stage):
     """A tracker after one frame with one part."""
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
     tracker = PoseTracker(stage)
     assert len(tracker.track(IMAGE, K)) == 1
     return tracker
@@ -95,7 +95,7 @@ def test_tracked_part_needs_the_network_only_when_due(stage):
     tracker = PoseTracker(stage, detect_every=10)
     for frame in range(30):
         angle = math.radians(8) * frame
-        stage.put("a", pivconnector(), (0.1 * math.sin(angle), 0.0, 0.3), (0.0, 0.0, angle))
+        stage.put("a", (0.1 * math.sin(angle), 0.0, 0.3), (0.0, 0.0, angle))
         (track,) = tracker.track(IMAGE, K)
         assert track.identity == 0
         assert track.detected == (frame == 0)
@@ -107,12 +107,12 @@ def test_steady_motion_is_predicted(stage):
     tracker = PoseTracker(stage)
     for frame in range(12):
         turn = (0.0, math.radians(6) * frame, 0.0)
-        stage.put("a", pivconnector(), (0.01 * frame, 0.0, 0.3), turn)
+        stage.put("a", (0.01 * frame, 0.0, 0.3), turn)
         (track,) = tracker.track(IMAGE, K)
     assert_allclose(track.velocity[:3], (0, math.radians(6), 0), atol=math.radians(1))
     assert_allclose(track.velocity[3:], (0.01, 0, 0), atol=0.002)
     before = stage.refinements
-    stage.put("a", pivconnector(), (0.12, 0.0, 0.3), (0.0, math.radians(72), 0.0))
+    stage.put("a", (0.12, 0.0, 0.3), (0.0, math.radians(72), 0.0))
     tracker.track(IMAGE, K)
     assert stage.refinements == before + 1  # the first prediction was accurate enough
 
@@ -123,7 +123,7 @@ def test_lost_part_is_searched_and_keeps_its_identity(stage, tracker):
         assert tracker.track(IMAGE, K) == []
     assert stage.looks == 8
     stage.hidden = set()
-    stage.put("a", pivconnector(), (0.08, 0.0, 0.4), (0.0, 0.0, 2.0))
+    stage.put("a", (0.08, 0.0, 0.4), (0.0, 0.0, 2.0))
     (track,) = tracker.track(IMAGE, K)
     assert (track.identity, track.detected) == (0, True)
     assert not track.velocity.any()
@@ -132,7 +132,7 @@ def test_lost_part_is_searched_and_keeps_its_identity(stage, tracker):
 
 
 def test_only_parts_above_the_threshold_are_tracked(stage):
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
     stage.min_score = 0.95
     tracker = PoseTracker(stage)
     assert tracker.track(IMAGE, K) == []
@@ -146,8 +146,8 @@ def test_only_parts_above_the_threshold_are_tracked(stage):
 
 def test_lost_part_is_forgotten(stage):
     tracker = PoseTracker(stage, detect_every=1_000_000)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    stage.put("b", servoholder(), (0.1, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
+    stage.put("b", (0.1, 0.0, 0.3), part=servoholder())
     tracker.track(IMAGE, K)
     stage.hidden = {"a"}
     for _ in range(FORGOTTEN + 2):
@@ -160,34 +160,35 @@ def test_lost_part_is_forgotten(stage):
 
 def test_equal_parts_keep_their_identities_when_one_reappears(stage):
     tracker = PoseTracker(stage, detect_every=5)
-    stage.put("left", pivconnector(), (-0.1, 0.0, 0.4))
-    stage.put("right", pivconnector(), (0.1, 0.0, 0.4))
-    positions = {
-        track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)
-    }
+    stage.put("left", (-0.1, 0.0, 0.4))
+    stage.put("right", (0.1, 0.0, 0.4))
+
+    def positions():
+        tracks = tracker.track(IMAGE, K)
+        return {track.identity: track.detection.T_cam_obj[0, 3] for track in tracks}
+
+    before = positions()
     stage.hidden = {"left"}
-    tracks = [tracker.track(IMAGE, K) for _ in range(4)][-1]
-    assert [item.detection.T_cam_obj[0, 3] for item in tracks] == [0.1]
+    assert [list(positions().values()) for _ in range(4)][-1] == [0.1]
     stage.hidden = set()
-    stage.put("third", pivconnector(), (0.0, 0.1, 0.4))
-    again = {track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)}
-    assert again == {**positions, 2: 0.0}
+    stage.put("third", (0.0, 0.1, 0.4))
+    assert positions() == {**before, 2: 0.0}
 
 
 def test_sudden_motion_is_tracked_without_the_network(stage, tracker):
     for _ in range(4):
         tracker.track(IMAGE, K)
     stage.unknown_to_network = {"a"}
-    stage.put("a", pivconnector(), (0.015, 0.0, 0.3), (math.radians(8), 0.0, 0.0))
+    stage.put("a", (0.015, 0.0, 0.3), (math.radians(8), 0.0, 0.0))
     (track,) = tracker.track(IMAGE, K)
     assert not track.detected
-    stage.put("a", pivconnector(), (0.1, 0.0, 0.3))
+    stage.put("a", (0.1, 0.0, 0.3))
     assert tracker.track(IMAGE, K) == []
 
 
 def test_repeated_detections_elsewhere_move_the_track(stage):
     tracker = PoseTracker(stage, detect_every=5)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
     tracker.track(IMAGE, K)
     true = stage.candidates
     turned = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.3]))
@@ -215,12 +216,12 @@ def test_track_moves_only_to_a_detection_that_agrees_better(stage, tracker):
 def test_doubtful_part_continues_its_motion(stage):
     tracker = PoseTracker(stage)
     for frame in range(10):
-        stage.put("a", pivconnector(), (0.005 * frame, 0.0, 0.3))
+        stage.put("a", (0.005 * frame, 0.0, 0.3))
         tracker.track(IMAGE, K)
     assert stage.looks == 1
     # A hand covers the part: half of the outline agrees, and the network detects nothing.
     stage.agreement, stage.unknown_to_network = 0.5, {"a"}
-    stage.put("a", pivconnector(), (0.047, 0.006, 0.3))
+    stage.put("a", (0.047, 0.006, 0.3))
     for number in range(1, PATIENCE + 1):
         (track,) = tracker.track(IMAGE, K)
         position = track.detection.T_cam_obj[:3, 3]

@@ -15,7 +15,6 @@ from dopepp.geometry.rotation import rotation_angle
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory, render
 
-SIZE = (1920, 1080)
 MOST_MM, MOST_DEG = 1.0, 0.4
 AROUND_PX = 40
 LENS = np.array([-0.18, 0.06, 0.0015, -0.001, 0.01])
@@ -44,19 +43,13 @@ class View:
 
 VGA = View(cut=(1 / 8, 0.0, 1 / 8, 0.0), scale=4 / 9)
 PORTRAIT = View(cut=(0.35, 0.0, 0.35, 0.0))
-VIEWS = st.builds(
-    View,
-    cut=st.tuples(*[st.floats(0.0, 0.5)] * 4),
-    scale=st.floats(0.4, 1.0),
-    turns=st.integers(0, 3),
-    lens=st.booleans(),
-    flipped=st.booleans(),
-)
+CUTS = st.tuples(*[st.floats(0.0, 0.5)] * 4)
+VIEWS = st.builds(View, CUTS, st.floats(0.4, 1.0), st.integers(0, 3), st.booleans(), st.booleans())
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return Factory([pivconnector()], PRESETS["wide"].reframed(*SIZE), seed=4).scene(0, 0)
+    return Factory([pivconnector()], PRESETS["wide"].reframed(1920, 1080), seed=4).scene(0, 0)
 
 
 @pytest.fixture(scope="module")

@@ -59,10 +59,15 @@ class Camera:
         self.released.set()
 
 
-def test_slow_reader_gets_the_newest_frame():
-    """Simulate a minute in which each inference takes six camera periods."""
+@pytest.fixture
+def camera():
     camera = Camera()
     camera.advance(0, wait=False)
+    return camera
+
+
+def test_slow_reader_gets_the_newest_frame(camera):
+    """Simulate a minute in which each inference takes six camera periods."""
     source = Live(0, lambda _: camera, camera.now)
     ages, frames = [], source.frames()
     for frame in islice(frames, 300):
@@ -75,17 +80,14 @@ def test_slow_reader_gets_the_newest_frame():
     assert source.rate == pytest.approx(30)
 
 
-def test_sequential_reading_falls_behind_the_camera():
-    camera = Camera()
+def test_sequential_reading_falls_behind_the_camera(camera):
     for _ in range(300):
         camera.advance(INFERENCE, wait=False)
         _, image = camera.read()
     assert camera.now() - camera.taken(image[..., ::-1]) > 40
 
 
-def test_frames_have_their_arrival_times():
-    camera = Camera()
-    camera.advance(0, wait=False)
+def test_frames_have_their_arrival_times(camera):
     times = []
     for frame in islice(Live(0, lambda _: camera, camera.now).frames(), 3):
         times.append(frame.time)

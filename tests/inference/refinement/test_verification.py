@@ -12,10 +12,11 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.inference.refinement.verification import EVIDENCE, Verifier, learned_model
-from dopepp.parts.part import Mesh, make_part
+from dopepp.parts.part import make_part
 from dopepp.recovery.detection import Detection
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import preset_of
+from tests.parts.makers import mesh_of
 
 K = camera_matrix(400, 400, 159.5, 119.5)
 POSE = make_transform(rotation_vector_to_matrix(np.array([2.4, 0.5, 0.4])), np.array([0, 0, 0.35]))
@@ -28,8 +29,7 @@ def wedge():
     pieces.append(trimesh.creation.cylinder(0.008, 0.05))
     for piece, shift in zip(pieces, [(0, 0, 0), (0.03, 0, 0.03), (-0.02, 0.01, 0.03)], strict=True):
         piece.apply_translation(shift)
-    mesh = trimesh.util.concatenate(pieces)
-    return make_part("wedge", Mesh(np.asarray(mesh.vertices), mesh.faces.astype(np.int32)))
+    return make_part("wedge", mesh_of(*pieces))
 
 
 PART = wedge()
@@ -50,10 +50,8 @@ def rendered():
 
 def evidence(image, K, T, part=PART):
     """Return the evidence about a pose by name."""
-    assert part.mesh is not None
     verifier = Verifier(make_outline_mesh(part.mesh.vertices, part.mesh.faces), part.diameter)
     values = verifier.evidence(image, K, T, COVARIANCE, 1.0)
-    assert values is not None
     assert np.isfinite(values).all()
     return dict(zip(EVIDENCE, values, strict=True))
 
@@ -69,8 +67,7 @@ def drawn_box(shade):
 
 
 def box_part():
-    box = trimesh.creation.box((0.06, 0.06, 0.06))
-    return make_part("box", Mesh(np.asarray(box.vertices), box.faces.astype(np.int32)))
+    return make_part("box", mesh_of(trimesh.creation.box((0.06, 0.06, 0.06))))
 
 
 def test_a_flat_silhouette_has_an_outline_and_no_creases():
@@ -119,9 +116,7 @@ def test_a_refined_detection_has_its_probability(rendered):
     right = Detection("wedge", 0.6, 0.6, T, pixels, pixels, 1.0, COVARIANCE)
     refiner = Refiner("region", [PART])
     assert refiner.verifies
-    probability = refiner(right, image, K, None).probability
-    assert probability is not None
-    assert probability > 0.5
+    assert refiner(right, image, K, None).probability > 0.5
     noise = np.random.default_rng(0).integers(0, 256, image.shape, np.uint8)
     assert refiner(right, noise, K, None).probability < 0.05
     away = replace(right, T_cam_obj=make_transform(T[:3, :3], np.array([5.0, 0.0, 0.3])))
@@ -129,8 +124,7 @@ def test_a_refined_detection_has_its_probability(rendered):
 
 
 def test_a_part_without_a_mesh_is_not_verified():
-    bare = replace(PART, mesh=None)
-    assert not Refiner("depth", [bare]).verifies
+    assert not Refiner("depth", [replace(PART, mesh=None)]).verifies
 
 
 def test_a_model_of_other_evidence_is_refused(monkeypatch):
