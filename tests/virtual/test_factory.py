@@ -61,9 +61,8 @@ def test_same_bytes_in_another_process_and_order(name):
     factory = make_factory(preset=small(name))
     expected = [digest(factory.render(*item)) for item in reversed(items)][::-1]
     script = DIGEST.format(folder=str(Path(__file__).parent), items=items, name=name)
-    result = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == str(expected)
     assert len(set(expected)) == len(items)
 

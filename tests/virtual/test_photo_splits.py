@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -37,9 +38,7 @@ def test_splits_are_disjoint_and_complete(tmp_path, count, expected):
     photos = write_numbers(tmp_path, range(count))
     splits = contents(photos)
     assert [len(split) for split in splits] == expected
-    assert sorted(content for split in splits for content in split) == sorted(
-        path.read_bytes() for path in photos.paths
-    )
+    assert sorted(chain(*splits)) == sorted(path.read_bytes() for path in photos.paths)
     assert all(photos.part(split).is_divided for split in SPLITS)
     assert photos.part("all") is photos
     assert not photos.is_divided

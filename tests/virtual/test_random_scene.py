@@ -66,11 +66,11 @@ def test_a_scale_divides_the_distance_and_keeps_the_pixel(scale):
 @pytest.mark.parametrize("scale", SCALES)
 def test_only_the_camera_moves(name, scale):
     for scene, near in zip(scenes(name, 1), scenes(name, scale), strict=True):
-        middles = [
-            np.mean([centre(o.objects[i]) for i in o.targets], axis=0) for o in (scene, near)
-        ]
-        np.testing.assert_allclose(middles[1], middles[0] / scale)
-        shift = middles[1] - middles[0]
+        first, second = (
+            np.mean([centre(s.objects[i]) for i in s.targets], axis=0) for s in (scene, near)
+        )
+        np.testing.assert_allclose(second, first / scale)
+        shift = second - first
         depths = [transform(item.T_cam_obj, item.surface.hull)[:, 2] for item in scene.objects]
         kept = [item for item, z in zip(scene.objects, depths, strict=True)
                 if (z + shift[2]).min() > NEAR]  # fmt: skip

@@ -12,9 +12,8 @@ from dopepp.virtual.surface.occlusion import look_up_sky, spread_directions
 
 def made(solid):
     mesh = solid.to_mesh()
-    return make_surface(
-        Mesh(np.asarray(mesh.vert_properties, float)[:, :3], np.asarray(mesh.tri_verts, np.int32))
-    )
+    vertices = np.asarray(mesh.vert_properties, float)[:, :3]
+    return make_surface(Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
 
 
 def looked_up(surface, face, share):

@@ -1,7 +1,6 @@
 """The rasteriser against closed forms and an independent ray caster."""
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +15,13 @@ from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.parts import load_part
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh
-from dopepp.virtual import Surface, make_surface, render
+from dopepp.virtual import make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.renderers.raster import visibility as shadow_module
 from dopepp.virtual.renderers.raster.visibility import shadow_map
-from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.scene import Light, Material, Scene, SceneObject
+from tests.virtual.conftest import even_light, pixel_rays
 
-MakeScene = Callable[..., Scene]
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
 LARGE = {"size": (640, 480), "focal": 600.0}
 
 
@@ -33,9 +31,7 @@ def at(surface, x, y, z):
 
 def cast_rays(scene):
     """Depth at every pixel centre by Möller–Trumbore over all triangles; inf for no hit."""
-    width, height = scene.size
-    v, u = np.mgrid[:height, :width].reshape(2, -1)
-    rays = np.stack([u, v, np.ones_like(u)], axis=1) @ np.linalg.inv(scene.K).T
+    rays = pixel_rays(scene).reshape(-1, 3)
     depth = np.full(len(rays), np.inf)
     for item in scene.objects:
         corners = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces]
@@ -49,7 +45,7 @@ def cast_rays(scene):
                 distance = (c - a) @ across / determinant
             hit = (first >= 0) & (second >= 0) & (first + second <= 1) & (distance > 0.01)
             depth[hit] = np.minimum(depth[hit], distance[hit])
-    return depth.reshape(height, width)
+    return depth.reshape(scene.size[::-1])
 
 
 def test_empty_scene_is_its_background(scene_of):
@@ -66,9 +62,7 @@ def test_plane_has_its_closed_form_depth(scene_of, sheet):
     offset = np.array([0.02, 0.01, 0.5])
     scene = scene_of(SceneObject(plane, make_transform(rotation, offset)))
     rendered = render(scene)
-    v, u = np.mgrid[: scene.size[1], : scene.size[0]]
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(scene.K).T
-    expected = rotation[:, 2] @ offset / (rays @ rotation[:, 2])
+    expected = rotation[:, 2] @ offset / (pixel_rays(scene) @ rotation[:, 2])
     assert (rendered.instances == 0).all()
     np.testing.assert_allclose(rendered.depth, expected, rtol=1e-6)
 
@@ -138,8 +132,7 @@ def test_vertices_bound_the_mask(scene_of, box_part, box_surface):
     # A pixel belongs to the mask when its centre is inside: the outermost one is < 1 px inside.
     low, high = keypoints.min(axis=0), keypoints.max(axis=0)
     inside = np.array([columns.min(), rows.min()]) - low, high - (columns.max(), rows.max())
-    assert np.min(inside) >= 0
-    assert np.max(inside) < 1.5
+    assert 0 <= np.min(inside) <= np.max(inside) < 1.5
 
 
 def test_edges_are_anti_aliased_by_coverage(scene_of, sheet):
@@ -239,14 +232,13 @@ def test_a_smooth_body_of_few_triangles_does_not_shadow_itself(
         body.invert()
     surface = surface_of(body)
     rng = np.random.default_rng(3)
-    black = Ambient(above=(0.0, 0.0, 0.0), below=(0.0, 0.0, 0.0))
     for _ in range(4):
         pose = make_transform(random_rotation(rng), np.array([0.0, 0.0, 0.18]))
         side = rng.normal(size=2)
         x, y = side / np.linalg.norm(side)
         item = SceneObject(surface, pose, Material((0.9, 0.9, 0.9), 1.0, specular=0.0))
-        lights = (Light((x, y, 0.3)),)
-        scene = scene_of(item, lights=lights, ambient=black, size=(320, 240), focal=300.0)
+        light = {"lights": (Light((x, y, 0.3)),), "ambient": even_light(0.0)}
+        scene = scene_of(item, **light, size=(320, 240), focal=300.0)
         rendered = render(scene)
         with_shadow = rendered.image.astype(int)
         with monkeypatch.context() as patch:
