@@ -185,7 +185,6 @@ def test_files_of_opencv_are_read_exactly(tmp_path, suffix, four, lens, is_colum
 
 
 def test_its_lens_projects_like_opencvs(tmp_path):
-    """COLMAP's and OpenCV's lens models project a point to the same pixel."""
     path = tmp_path / "cameras.txt"
     path.write_text(COLMAP.format("OPENCV 640 480 600 610 320 240 -0.1 0.05 0.001 -0.002"))
     camera, (x, y) = read_camera(path), (0.2, -0.15)
@@ -270,7 +269,6 @@ MARKS = [b"[", b"{", b"-", b": ", b"&a ", b"!!", b"<", b"1e999", b"\n"]
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
-    """With bytes replaced, inserted and removed, a file gives a camera or a UserError."""
     content = bytearray(data.draw(st.sampled_from(SAMPLES)).encode())
     for _ in range(data.draw(st.integers(1, 4))):
         start = data.draw(st.integers(0, len(content)))

@@ -298,7 +298,6 @@ def covariances(rng, n):
 
 @pytest.mark.parametrize("name", ["box", "box off its origin", "plate"])
 def test_the_covariance_matches_the_scatter_of_poses(name):
-    """The poses of many noisy observations scatter like their estimated covariances."""
     rng = np.random.default_rng(5)
     cuboid = CUBOIDS[name]
     truth = look_at(cuboid, rng)

@@ -52,7 +52,6 @@ def test_seeds_and_instances_add_their_variances():
 
 @pytest.mark.parametrize("num_seeds", [2, 3, 5])
 def test_intervals_of_few_seeds_are_wide_enough(num_seeds):
-    """Intervals contain the true difference when training noise dominates."""
     rng, hits = np.random.default_rng(8), 0
     for trial in range(150):
         noise = rng.normal(0, 0.1, (2, num_seeds))[:, :, None]

@@ -178,7 +178,8 @@ def test_the_distance_of_a_match_is_between_centres():
 
 def test_objects_do_not_match_each_other():
     metric = PoseMetrics([part("a"), part("b")])
-    with pytest.raises(UserError, match="of 'c'; allowed: detections of the evaluated"):
+    other = "got a detection of 'c'; allowed: detections of the evaluated"
+    with pytest.raises(UserError, match=other):
         metric.update([Detection("c", 1, pose())], [])
     metric.update([Detection("a", 0.9, pose())], [truth("b", pose()), truth("other", pose())])
     rows = metric.compute()

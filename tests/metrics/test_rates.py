@@ -62,7 +62,7 @@ def test_auc_equals_loops(errors):
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: auc(ONES, 0.1, "coco"), UserError, "auc method 'coco'; allowed: exact, voc"),
+        (lambda: auc(ONES, 0.1, "coco"), UserError, "got auc method 'coco'; allowed: exact, voc"),
         (lambda: auc(ONES, 0), UserError, "got max_threshold=0"),
         (lambda: average_recall(ONES, []), UserError, "no thresholds"),
         (lambda: match(ONES, torch.zeros(3, 1), 0.1), ValueError, "2 scores need as many rows"),
