@@ -6,10 +6,8 @@ import torch
 def make_spec():
     """Return a spec; ``backbone_``, ``attention_`` and ``head_`` prefixes set arguments."""
 
-    def make(
-        backbone="DSC", attention="CBAM", head="MultiScale", activation="exp", num_objects=1,
-        **arguments,
-    ):  # fmt: skip
+    def make(backbone="DSC", attention="CBAM", head="MultiScale", activation="exp", **arguments):
+        num_objects = arguments.pop("num_objects", 1)
         module = "efficientnet" if backbone == "EfficientNetLite" else "backbones"
         nodes = {
             "backbone": {"_target_": f"dopepp.models.{module}.{backbone}"},

@@ -30,7 +30,11 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
         (VGG19, {"width": -1}, "width=-1"),
         (VGG19, {**WITH_WEIGHTS, "width": 0.5}, FULL_WIDTH),
         (VGG19, {**WITH_WEIGHTS, "batch_norm": True}, FULL_WIDTH),
-        (VGG19, {"weights_path": "no.pth"}, "is not a file; allowed: a torchvision state_dict"),
+        (
+            VGG19,
+            {"weights_path": "no.pth"},
+            "which is not a file; allowed: a torchvision state_dict",
+        ),
         (Pyramid, {"channels": (32, 96, 128)}, r"channels=.*; allowed: a list of 4 integers"),
         (Pyramid, {"channels": (32, 96, 4, 128)}, "a list of 4 integers from 8 to 1024"),
         (Pyramid, {"channels": (32, 96, 128, 10**9)}, "channels="),

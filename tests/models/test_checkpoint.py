@@ -100,16 +100,13 @@ def test_a_training_checkpoint_is_read_by_its_two_keys(checkpoint, tmp_path):
     assert read(tmp_path / "last.ckpt").state_dict.keys() == checkpoint.state_dict.keys()
 
 
-def test_numpy_scalars_become_plain_values(checkpoint, tmp_path):
+def test_numpy_scalars_become_plain_values_and_other_values_are_refused(checkpoint, tmp_path):
     checkpoint.recovery = {"a": np.float64(0.5), "b": np.float32(0.25), "c": np.int64(3)}
     checkpoint.data = {"K": np.eye(3), "sizes": (1, 2), "none": None, "flag": np.bool_(True)}
     write_atomic(checkpoint.to_file(), tmp_path / "a.ckpt")
     loaded = read(tmp_path / "a.ckpt")
     assert loaded.recovery == {"a": 0.5, "b": 0.25, "c": 3}
     assert loaded.data == {"K": np.eye(3).tolist(), "sizes": [1, 2], "none": None, "flag": True}
-
-
-def test_values_that_are_not_plain_are_refused_before_writing(checkpoint):
     checkpoint.data = {"path": Path("here")}
     with pytest.raises(TypeError, match="holds plain values"):
         checkpoint.to_payload()

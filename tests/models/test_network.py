@@ -89,6 +89,13 @@ def test_maps_of_nine_channels_cost_less_than_features(make_spec):
         assert num_parameters(network) == count
 
 
+def test_the_fast_network_has_the_weights_that_are_documented(make_spec):
+    """conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width."""
+    widths = {"backbone_width": 0.5, "head_width": 0.5}
+    network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **widths))
+    assert num_parameters(network) == 2_645_305
+
+
 def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
     network = build_network(small_spec)
     inputs_of_layer = []
@@ -200,13 +207,6 @@ def test_belief_and_field_share_only_the_trunk():
 )
 def test_scaled_channels(channels, width, expected):
     assert scaled_channels(channels, width) == expected
-
-
-def test_the_fast_network_has_the_weights_that_are_documented(make_spec):
-    """conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width."""
-    widths = {"backbone_width": 0.5, "head_width": 0.5}
-    network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **widths))
-    assert num_parameters(network) == 2_645_305
 
 
 @pytest.mark.parametrize("half", [False, True])

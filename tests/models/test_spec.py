@@ -15,7 +15,8 @@ DSC = "dopepp.models.backbones.DSC"
 
 
 def test_builds_a_network_from_plain_values(make_spec):
-    spec = make_spec("DSC", "SE", "Cascade", "identity", 3, backbone_width=0.25, head_width=0.125)
+    options = {"num_objects": 3, "backbone_width": 0.25, "head_width": 0.125}
+    spec = make_spec("DSC", "SE", "Cascade", "identity", **options)
     before = repr(spec)
     network = build_network(spec)
     assert repr(spec) == before

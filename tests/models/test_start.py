@@ -11,8 +11,7 @@ from dopepp.models.storage import read_safetensors
 from dopepp.parts.part import Mesh, make_part
 from tests.models.conftest import assert_weights, weights_of
 
-OUTPUTS = {f"head.{kind}_branches.0.1.{tensor}"
-           for kind in ("belief", "field") for tensor in ("weight", "bias")}  # fmt: skip
+OUTPUTS = {f"head.{k}_branches.0.1.{t}" for k in ("belief", "field") for t in ("weight", "bias")}
 FAST = {"backbone_width": 0.5, "head_width": 0.5}
 
 

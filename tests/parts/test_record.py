@@ -134,9 +134,11 @@ JUNK = st.recursive(
 )
 
 
+PLACES = st.none() | st.tuples(st.integers(0, 1), st.integers(0, 2))
+
+
 @settings(max_examples=400)
-@given(st.sampled_from(sorted(RECORD)), st.none() | st.tuples(st.integers(0, 1), st.integers(0, 2)),
-       JUNK)  # fmt: skip
+@given(st.sampled_from(sorted(RECORD)), PLACES, JUNK)
 def test_junk_in_a_field_or_a_number_is_refused_or_valid(field, place, junk):
     record = copy.deepcopy(RECORD)
     if place is None or field not in ("cuboid", "points"):

@@ -25,9 +25,17 @@ EXTRA = [("uchar", "red", [7] * 8), ("double", "quality", [1.5] * 8)]
 
 
 def ply(
-    form, faces, *, columns=(), texture=False, extra=False, types=("uchar", "int"), promised=None,
-    count=None, newline="\n",
-):  # fmt: skip
+    form,
+    faces,
+    *,
+    columns=(),
+    texture=False,
+    extra=False,
+    types=("uchar", "int"),
+    promised=None,
+    count=None,
+    newline="\n",
+):
     """Write a box with further columns (kind, name, values) per vertex.
 
     With ``extra``, further columns and a further table stand before, between and behind.
