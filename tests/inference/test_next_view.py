@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform, move_pose
-from dopepp.geometry.camera import transform as moved
+from dopepp.geometry.camera import (
+    camera_matrix,
+    invert_transform,
+    make_transform,
+    move_pose,
+    transform,
+)
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.several_views.next_view import next_best_view, point_error
@@ -70,7 +75,7 @@ def test_point_error_is_the_rms_error_of_sampled_poses(mesh):
     spread = rng.normal(size=(6, 6)) * np.repeat([0.01, 0.001], 3)[:, None]
     covariance, pose = spread @ spread.T, make_transform(random_rotation(rng), rng.normal(size=3))
     draws = [move_pose(pose, spread @ rng.normal(size=6)) for _ in range(4000)]
-    at = moved(pose, mesh.vertices)
-    squares = [((moved(draw, mesh.vertices) - at) ** 2).sum(axis=1).mean() for draw in draws]
+    at = transform(pose, mesh.vertices)
+    squares = [((transform(draw, mesh.vertices) - at) ** 2).sum(axis=1).mean() for draw in draws]
     expected = math.sqrt(np.mean(squares))
     assert point_error(mesh, pose, covariance) == pytest.approx(expected, rel=0.05)

@@ -52,7 +52,6 @@ def test_silhouette_is_the_renderers_mask(index):
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 4.0])
 def test_lines_and_text_scale_with_the_image(factor):
-    """Compare the drawings of a scene in two image sizes."""
     width, height = round(640 * factor), round(480 * factor)
     own_K = K.copy()
     own_K[:2] *= factor
