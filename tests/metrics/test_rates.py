@@ -72,6 +72,7 @@ def test_auc_equals_loops(errors):
         (lambda: expected_calibration_error(ONES * NAN, TRUE), ValueError, r"\[0, 1\]"),
         (lambda: expected_calibration_error(ONES, TRUE[:1]), ValueError, "bins"),
     ],
+    ids=["method", "range", "thresholds", "rows", "too many", "lengths", "above 1", "NaN", "bins"],
 )
 def test_wrong_arguments_are_refused(call, error, message):
     with pytest.raises(error, match=message):
