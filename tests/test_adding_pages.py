@@ -26,12 +26,12 @@ from dopepp.virtual.renderers import RENDERERS
 DOCS = Path(__file__).parents[1] / "docs" / "how-to"
 
 
-def documented(page: str) -> str:
+def documented(page):
     """Return the first block of Python code of a page."""
     return (DOCS / page).read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
 
 
-def module_of(page: str, name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def module_of(page, name, monkeypatch):
     """Run a page's module under the module name of the page."""
     module = ModuleType(name)
     exec(documented(page), vars(module))
@@ -97,14 +97,14 @@ def test_the_documented_error_is_the_angle_between_axes(monkeypatch):
 class OneWeight(LightningModule):
     """A module with a single weight w and the loss 3·w, whose gradient has length 3."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.w = torch.nn.Parameter(torch.ones(1))
 
-    def training_step(self, batch: torch.Tensor) -> torch.Tensor:
+    def training_step(self, batch):
         return 3 * self.w.sum()
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
+    def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 

@@ -2,11 +2,9 @@
 
 import re
 import shlex
-from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
 
 import pytest
 import typer.main
@@ -18,22 +16,22 @@ from dopepp.cli import app
 from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES, SHORT_NAMES
 from dopepp.virtual.presets import PRESETS
 
-ROOT: Final = Path(__file__).parents[1]
-CONF: Final = ROOT / "conf"
-DOCUMENTS: Final = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+ROOT = Path(__file__).parents[1]
+CONF = ROOT / "conf"
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
-FENCE: Final = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-SPAN: Final = re.compile(r"`([^`\n]+)`")
-LINK: Final = re.compile(r"\]\(([^)\s]+)\)")
-OTHER_TOOLS: Final = {"--cfg"}
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+SPAN = re.compile(r"`([^`\n]+)`")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+OTHER_TOOLS = {"--cfg"}
 """Hydra's options that documents name without a command."""
 
-USAGE_ERROR: Final = typer.BadParameter.__mro__[1]
+USAGE_ERROR = typer.BadParameter.__mro__[1]
 """The usage error of the click version that Typer uses."""
-APP: Final = typer.main.get_command(app)
-APP_OPTIONS: Final = {text for parameter in APP.params for text in parameter.opts}
-COMMANDS: Final = APP.commands
-OPTIONS: Final = {
+APP = typer.main.get_command(app)
+APP_OPTIONS = {text for parameter in APP.params for text in parameter.opts}
+COMMANDS = APP.commands
+OPTIONS = {
     name: {
         text
         for subcommand in (command, *getattr(command, "commands", {}).values())
@@ -45,7 +43,7 @@ OPTIONS: Final = {
 }
 
 
-ENTRIES: Final = {
+ENTRIES = {
     ("python", "train.py"): SHORT_NAMES,
     ("dopepp", "train"): SHORT_NAMES,
     ("python", "evaluate.py"): EVALUATION_SHORT_NAMES,
@@ -54,23 +52,23 @@ ENTRIES: Final = {
 """Programs that accept Hydra's overrides, with their short option names."""
 
 
-def fenced(text: str, language: str) -> list[str]:
+def fenced(text, language):
     return [content for name, content in FENCE.findall(text) if name == language]
 
 
-def typed_commands(text: str) -> Iterator[list[str]]:
+def typed_commands(text):
     """Yield the words of every shell command in a document's fenced blocks."""
     for content in fenced(text, "bash"):
         yield from words_of(content.replace("\\\n", " ").splitlines())
 
 
-def commands(text: str) -> Iterator[list[str]]:
+def commands(text):
     """Yield the words of every shell command in a document's fenced blocks and code spans."""
     yield from typed_commands(text)
     yield from words_of(SPAN.findall(FENCE.sub("", text)))
 
 
-def words_of(lines: Sequence[str]) -> Iterator[list[str]]:
+def words_of(lines):
     for line in lines:
         for command in line.split("&&"):
             try:
@@ -81,13 +79,13 @@ def words_of(lines: Sequence[str]) -> Iterator[list[str]]:
                 yield words
 
 
-def slug(heading: str) -> str:
+def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
-def config_keys() -> set[str]:
+def config_keys():
     """Return every key of every file in conf/, from the root of the composed configuration."""
-    keys: set[str] = set()
+    keys = set()
     for path in CONF.rglob("*.yaml"):
         text = path.read_text()
         folders = path.parent.relative_to(CONF).parts
@@ -96,17 +94,17 @@ def config_keys() -> set[str]:
     return keys
 
 
-def collect(node: object, start: str, keys: set[str]) -> None:
+def collect(node, start, keys):
     keys.add(start)
     if isinstance(node, dict):
         for key, value in node.items():
             collect(value, f"{start}.{key}".lstrip("."), keys)
 
 
-def is_preset_field(path: list[str]) -> bool:
+def is_preset_field(path):
     """Return whether any preset has a field, given by its path."""
 
-    def has(value: object, names: list[str]) -> bool:
+    def has(value, names):
         if not names:
             return True
         existing = {entry.name for entry in fields(value)} if is_dataclass(value) else ()
@@ -115,10 +113,10 @@ def is_preset_field(path: list[str]) -> bool:
     return any(has(preset, path) for preset in PRESETS.values())
 
 
-KEYS: Final = config_keys()
+KEYS = config_keys()
 
 
-def option_problem(override: str) -> str | None:
+def option_problem(override):
     """Return the problem of an override ``key=value`` or ``group=file``, or None."""
     key, _, value = override.partition("=")
     key = key.lstrip("+")
@@ -162,7 +160,7 @@ def test_console_commands_and_their_options_exist(path):
     assert not bad
 
 
-def preset_problems(words: list[str]) -> list[str]:
+def preset_problems(words):
     """Return the ``--set`` and ``--preset`` of a command that name no field or preset."""
     pairs = list(pairwise(words))
     changes = [value.partition("=")[0] for option, value in pairs if option == "--set"]
@@ -170,7 +168,7 @@ def preset_problems(words: list[str]) -> list[str]:
     return bad + [value for option, value in pairs if option == "--preset" and value not in PRESETS]
 
 
-GUIDES: Final = [path for path in DOCUMENTS if path.name not in {"CHANGELOG.md", "options.md"}]
+GUIDES = [path for path in DOCUMENTS if path.name not in {"CHANGELOG.md", "options.md"}]
 """The changelog also names removed options, and options.md is generated from the code."""
 
 
@@ -203,7 +201,7 @@ def test_fenced_commands_are_accepted_by_their_parsers(path):
     assert not {command: problem for command, problem in results.items() if problem}
 
 
-def parse_problem(words: list[str]) -> str | None:
+def parse_problem(words):
     """Parse a command without running it; return the parser's error message, or None."""
     program, arguments = tuple(words[:2]), words[2:]
     try:

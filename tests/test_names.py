@@ -1,7 +1,5 @@
 """Names in the package: distinct public classes and modules, few placeholders for nouns."""
 
-from __future__ import annotations
-
 import ast
 from collections import defaultdict
 from pathlib import Path
@@ -15,26 +13,26 @@ MAX_ONE = 20
 MAX_FMT_SKIP = 40
 
 
-def module_name(path: Path) -> str:
+def module_name(path):
     """Return a module's name; a package counts by its folder's name."""
     return path.parent.name if path.stem == "__init__" else path.stem
 
 
-def collisions(places: dict[str, list[str]]) -> dict[str, list[str]]:
+def collisions(places):
     """Return public names that are defined in several modules."""
     public = {name: paths for name, paths in places.items() if name and name[0] != "_"}
     return {name: paths for name, paths in public.items() if len(paths) > 1}
 
 
-def test_modules_have_distinct_names() -> None:
-    modules: dict[str, list[str]] = defaultdict(list)
+def test_modules_have_distinct_names():
+    modules = defaultdict(list)
     for path in SOURCES:
         modules[module_name(path)].append(str(path))
     assert collisions(modules) == {}
 
 
-def test_public_classes_have_distinct_names() -> None:
-    classes: dict[str, list[str]] = defaultdict(list)
+def test_public_classes_have_distinct_names():
+    classes = defaultdict(list)
     for path, tree in TREES.items():
         for node in tree.body:
             if isinstance(node, ast.ClassDef):
@@ -42,7 +40,7 @@ def test_public_classes_have_distinct_names() -> None:
     assert collisions(classes) == {}
 
 
-def test_variables_are_rarely_called_one() -> None:
+def test_variables_are_rarely_called_one():
     nodes = [(path, node) for path, tree in TREES.items() for node in ast.walk(tree)]
     bound = [
         f"{path}:{node.lineno}"
@@ -53,6 +51,6 @@ def test_variables_are_rarely_called_one() -> None:
     assert len(bound) <= MAX_ONE, bound
 
 
-def test_formatter_is_rarely_overridden() -> None:
+def test_formatter_is_rarely_overridden():
     skips = {str(path): text.count("# fmt: skip") for path, text in SOURCES.items()}
     assert sum(skips.values()) <= MAX_FMT_SKIP, {path: num for path, num in skips.items() if num}

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "docs" / "notebooks" / "from_stl_to_poses.ipynb"
 
 
-def named(node: object) -> list[str]:
+def named(node):
     """Return the pages below a node of the navigation, in order."""
     if isinstance(node, str):
         return [node]

@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
-from typing import Any
 
 import pytest
 from setuptools import Distribution
@@ -23,7 +22,7 @@ COMPILED = shutil.ignore_patterns("__pycache__")
 def test_it_contains_every_file_that_the_program_reads(monkeypatch):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("setuptools.setup", lambda **options: setup_options.update(options))
-    setup_options: dict[str, Any] = {}
+    setup_options = {}
     exec((ROOT / "setup.py").read_text(), {})
     build = Distribution({**setup_options, "script_name": "setup.py"}).get_command_obj("build_py")
     build.ensure_finalized()
@@ -49,7 +48,7 @@ Run = Callable[..., "CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory) -> Run:
+def installed(tmp_path_factory):
     """Build the wheel, and install it with this environment's libraries; run it in any folder."""
     base = tmp_path_factory.mktemp("wheel")
     own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
@@ -58,7 +57,7 @@ def installed(tmp_path_factory) -> Run:
     for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, base / "sources")
 
-    def pip(*arguments: str) -> None:
+    def pip(*arguments):
         command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
         subprocess.run(command, check=True, capture_output=True, env=own)
 
@@ -71,7 +70,7 @@ def installed(tmp_path_factory) -> Run:
     # .pth files of this path are not read, so an editable dopepp is not imported.
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
 
-    def run(*arguments: str, folder: Path) -> "CompletedProcess[str]":
+    def run(*arguments, folder):
         command = [str(base / "venv" / "bin" / "dopepp"), *arguments]
         return subprocess.run(
             command, cwd=folder, env=own | {"WANDB_MODE": "offline"},
@@ -83,7 +82,7 @@ def installed(tmp_path_factory) -> Run:
 
 @pytest.mark.slow
 def test_a_wheel_trains_and_measures_in_an_empty_folder(installed, tiny_options, tmp_path):
-    def run(*arguments: str, code: int = 0) -> str:
+    def run(*arguments, code=0):
         done = installed(*arguments, folder=tmp_path)
         assert done.returncode == code, done.stdout + done.stderr
         return done.stdout + done.stderr

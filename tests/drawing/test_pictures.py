@@ -104,23 +104,29 @@ def test_photos_of_8_and_16_bits(tmp_path, image, suffix, channels, kind):
     np.testing.assert_array_equal(read_photo(path), expected)
 
 
-def test_errors_about_photos_contain_a_fix(tmp_path, image):
-    def check_error(name, fix):
-        with pytest.raises(UserError, match=fix) as error:
-            read_photo(tmp_path / name)
-        assert name in str(error.value)
+SAVE = "fix: save it as PNG, e.g. with ImageMagick: magick"
 
-    for name in ("photo.gif", "several.tiff"):
-        pages = [Image.fromarray(image), Image.fromarray(image[::-1])]
-        pages[0].save(tmp_path / name, save_all=True, append_images=pages[1:])
-        check_error(name, f"fix: save it as PNG, e.g. with ImageMagick: magick {name} image.png")
+
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [
+        ("several.gif", f"{SAVE} several.gif image.png"),
+        ("several.tiff", f"{SAVE} several.tiff image.png"),
+        ("float.tiff", "of mode F"),
+        ("raw.png", "-auto-level"),
+        ("colours.png", "-auto-level"),
+        ("text.png", "save it as PNG"),
+        ("missing.png", "pass the path of an existing file"),
+    ],
+)
+def test_errors_about_photos_contain_a_fix(tmp_path, image, name, fix):
+    first, second = Image.fromarray(image), Image.fromarray(image[::-1])
+    for several in ("several.gif", "several.tiff"):
+        first.save(tmp_path / several, save_all=True, append_images=[second])
     Image.fromarray(image[..., 0].astype(np.float32)).save(tmp_path / "float.tiff")
-    check_error("float.tiff", "of mode F")
     # 12 significant bits in 16: the upper eight bits are almost black.
     cv2.imwrite(str(tmp_path / "raw.png"), 16 * image[..., 0].astype(np.uint16))
-    check_error("raw.png", "-auto-level")
     cv2.imwrite(str(tmp_path / "colours.png"), 16 * image.astype(np.uint16))
-    check_error("colours.png", "-auto-level")
     (tmp_path / "text.png").write_text("no image")
-    check_error("text.png", "save it as PNG")
-    check_error("missing.png", "pass the path of an existing file")
+    with pytest.raises(UserError, match=f"{name}.*{fix}"):
+        read_photo(tmp_path / name)

@@ -1,12 +1,8 @@
 """Time per frame with known delays; agreement of two estimators with known maps and detections."""
 
-from __future__ import annotations
-
 import math
 import time
-from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,16 +25,13 @@ def pose(x=0.0, z=0.3, degrees=0.0, name="pivconnector"):
     return SimpleNamespace(object=name, T_cam_obj=make_transform(R, np.array([x, 0.0, z])))
 
 
-@dataclass
 class ConstantEstimator:
     """An estimator with constant detections and maps."""
 
-    detections: list[Any]
-    belief: float = 0.5
-    network: Any = field(default_factory=lambda: SimpleNamespace(size_multiple=32))
-    checkpoint: Any = field(
-        default_factory=lambda: Checkpoint({}, {}, [pivconnector()], (128, 96), 8, 1.0)
-    )
+    def __init__(self, detections, belief=0.5):
+        self.detections, self.belief = detections, belief
+        self.network = SimpleNamespace(size_multiple=32)
+        self.checkpoint = Checkpoint({}, {}, [pivconnector()], (128, 96), 8, 1.0)
 
     def predict(self, image, K, cropped):
         return self.detections
@@ -108,11 +101,8 @@ class Slow:
 
 def test_timing_of_first_frame_and_steps(tiny_spec):
     network = build_network(tiny_spec).eval()
-    checkpoint = Checkpoint(
-        tiny_spec, network.state_dict(), [pivconnector()], (64, 64), 8, 1.0,
-        {"centroid_threshold": 1.0},
-    )  # fmt: skip
-    estimator = PoseEstimator(Slow(network), checkpoint)
+    rest = [pivconnector()], (64, 64), 8, 1.0, {"centroid_threshold": 1.0}
+    estimator = PoseEstimator(Slow(network), Checkpoint(tiny_spec, network.state_dict(), *rest))
     images = [(np.zeros((64, 64, 3), np.uint8), camera_matrix(64, 64, 31.5, 31.5))] * 2
     timing = time_frames(estimator, images, 4)
     assert estimator.network.calls == 1 + WARM_UP + 4

@@ -21,9 +21,9 @@ from dopepp.virtual.sensor import Sensor, capture, defocus
 PART, PRESET, SEED = pivconnector(), PRESETS["quickstart"], 411
 
 
-@pytest.fixture(scope="module")
-def estimator():
-    return PoseEstimator.load("pretrained/pivconnector")
+@pytest.fixture
+def estimator(piv_estimator):
+    return piv_estimator
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,9 @@ def first(estimator, image, K, parts=None, **options):
     """Return the subject of the first diagnosis with a fix; empty if all is well."""
     findings = diagnose(Case(estimator, image, K, parts or estimator.parts, **options))
     assert len(findings) == len(CHECKS)
-    assert all(
-        finding.sentence and str(finding).startswith(f"{finding.subject}: ") for finding in findings
-    )
+    for finding in findings:
+        assert finding.sentence
+        assert str(finding).startswith(f"{finding.subject}: ")
     return next((finding.subject for finding in findings if finding.fix), "")
 
 
@@ -51,10 +51,8 @@ def longer(K, factor):
 
 
 def test_good_images_have_no_diagnosis(estimator, factory):
-    firsts = Counter()
-    for index in range(8):
-        rendered = factory.render(0, index)
-        firsts[first(estimator, rendered.image, rendered.scene.K)] += 1
+    rendered = [factory.render(0, index) for index in range(8)]
+    firsts = Counter(first(estimator, item.image, item.scene.K) for item in rendered)
     # The part is not detected on a few of a hundred images; these are diagnosed.
     assert firsts[""] >= 7, firsts
     assert not set(firsts) - {"", "visibility", "pose"}
@@ -72,10 +70,8 @@ def test_good_images_have_no_diagnosis(estimator, factory):
     ids=["blurred", "dark", "bright", "K too long", "K too short"],
 )
 def test_fault_of_the_image_is_diagnosed_first(estimator, factory, fault, subject):
-    firsts = Counter()
-    for index in range(4):
-        rendered = factory.render(0, index)
-        firsts[first(estimator, *fault(rendered.image, rendered.scene.K))] += 1
+    rendered = [factory.render(0, index) for index in range(4)]
+    firsts = Counter(first(estimator, *fault(item.image, item.scene.K)) for item in rendered)
     assert firsts[subject] >= 3, firsts
 
 
@@ -123,18 +119,14 @@ def test_detections_away_from_the_part_are_reported(estimator, factory, empty):
     assert not elsewhere(rendered.image, (u + 0.8 * half, v)).fix
     assert not elsewhere(rendered.image, (0.0, 0.0), (u, v)).fix
     beside = elsewhere(rendered.image, (u + 1.3 * half, v))
-    assert re.match(
-        r"1 of 1 detections above [\d.]+ are away from every part",
-        beside.sentence,
-    )
+    assert re.match(r"1 of 1 detections above [\d.]+ are away from every part", beside.sentence)
     named = re.search(r"at \((\d+), (\d+)\)", beside.sentence)
     assert list(map(float, named.groups())) == pytest.approx([u, v], abs=3)
     assert "virtual.negative_photos" in beside.fix
     assert "on an image without the part" in elsewhere(rendered.image).sentence
     without = empty.render(0, 0)
-    findings = diagnose(
-        Case(estimator, without.image, without.scene.K, estimator.parts, centres=())
-    )
+    case = Case(estimator, without.image, without.scene.K, estimator.parts, centres=())
+    findings = diagnose(case)
     assert [(each.subject, each.fix) for each in findings] == [("part", ""), ("elsewhere", "")]
 
 
@@ -177,7 +169,7 @@ def test_part_without_mesh_or_trained_sizes_is_diagnosed(factory):
         assert (findings["visibility"].fix == "") == (image is rendered.image)
 
 
-def shapes(noise: float = 0.0) -> np.ndarray:
+def shapes(noise=0.0):
     """Return a sharp image of large shapes."""
     image = np.full((240, 320, 3), 60, np.uint8)
     cv2.rectangle(image, (30, 40), (140, 190), (180, 170, 90), -1)
@@ -196,14 +188,11 @@ def test_edge_width_measures_a_known_blur(sigma, noise):
     assert width == pytest.approx(sigma, rel=0.2)
 
 
-@pytest.mark.parametrize("noise", [0.0, 4.0])
-def test_sharp_edges_are_narrow(noise):
-    assert edge_width(shapes(noise)) < 0.8
-
-
-@pytest.mark.parametrize("level", [0, 90, 255])
-def test_plain_image_has_no_edge_width(level):
-    assert edge_width(np.full((64, 64, 3), level, np.uint8)) is None
+def test_sharp_edges_are_narrow_and_a_plain_image_has_none():
+    for noise in (0.0, 4.0):
+        assert edge_width(shapes(noise)) < 0.8
+    for level in (0, 90, 255):
+        assert edge_width(np.full((64, 64, 3), level, np.uint8)) is None
 
 
 def test_highlights_and_clipped_share():

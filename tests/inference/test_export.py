@@ -1,7 +1,5 @@
 """Exported networks: the same maps and poses as PyTorch's."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import replace
@@ -65,32 +63,24 @@ def written(original, layout, folder, precision="fp32", images=()):
 
 @pytest.fixture(scope="module", params=EXPORTERS)
 def exported(request, original, tmp_path_factory):
-    for package in {"onnx": ("onnx", "onnxruntime", "onnxscript"), "openvino": ("openvino",)}.get(
-        request.param, ()
-    ):
+    packages = {"onnx": ("onnx", "onnxruntime", "onnxscript"), "openvino": ("openvino",)}
+    for package in packages.get(request.param, ()):
         pytest.importorskip(package)
     return written(original, request.param, tmp_path_factory.mktemp("exported"))
 
 
-def random_images(*shape: int) -> torch.Tensor:
+def random_images(*shape):
     return torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))
 
 
 def test_export_has_the_same_maps_for_any_batch_and_size(exported, original):
-    exported_estimator, original_estimator = (
-        PoseEstimator.load(exported),
-        PoseEstimator.load(original),
-    )
-    assert exported_estimator.network.size_multiple == original_estimator.network.size_multiple
+    networks = [PoseEstimator.load(path).network for path in (exported, original)]
+    assert networks[0].size_multiple == networks[1].size_multiple
     for shape in ((1, 3, 96, 128), (1, 3, 32, 32), (3, 3, 160, 64)):
         images = random_images(*shape)
         with torch.inference_mode():
-            pairs = zip(
-                exported_estimator.network.maps(images),
-                original_estimator.network.maps(images),
-                strict=True,
-            )
-        for first, other in pairs:
+            maps = [network.maps(images) for network in networks]
+        for first, other in zip(*maps, strict=True):
             assert other.std() > 0.01
             # Vectors of a random network are up to 20 long, those of a trained network 1.
             size = max(1.0, float(other.abs().max()))
@@ -98,23 +88,13 @@ def test_export_has_the_same_maps_for_any_batch_and_size(exported, original):
 
 
 def test_renamed_export_is_the_same_estimator(exported, original, tmp_path):
-    ending = "".join(exported.suffixes)
-    moved = tmp_path / f"renamed{ending}"
+    moved = tmp_path / f"renamed{''.join(exported.suffixes)}"
     (shutil.copytree if exported.is_dir() else shutil.copy)(exported, moved)
-    exported_estimator, original_estimator = (
-        PoseEstimator.load(item, refine="region") for item in (moved, original)
-    )
-    assert (
-        replace(exported_estimator.checkpoint, state_dict={}).to_payload()
-        == original_estimator.checkpoint.to_payload()
-    )
-    assert exported_estimator.recovery == original_estimator.recovery
+    ours, theirs = (PoseEstimator.load(path, refine="region") for path in (moved, original))
+    assert replace(ours.checkpoint, state_dict={}).to_payload() == theirs.checkpoint.to_payload()
+    assert ours.recovery == theirs.recovery
     image = random_images(96, 128, 3).numpy()
-    detections, expected = (
-        estimator.predict(image, K) for estimator in (exported_estimator, original_estimator)
-    )
-    assert len(detections) == len(expected)
-    for detection, other in zip(detections, expected, strict=True):
+    for detection, other in zip(ours.predict(image, K), theirs.predict(image, K), strict=True):
         assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-4)
 
 
@@ -122,8 +102,7 @@ def test_renamed_export_is_the_same_estimator(exported, original, tmp_path):
 def test_half_precision_halves_the_file(original, tmp_path):
     pytest.importorskip("onnxscript")
     whole, half = (written(original, "onnx", tmp_path / item, item) for item in ("fp32", "fp16"))
-    described = len(half.read_bytes()) - 2 * len(whole.read_bytes())
-    assert described < 0
+    assert len(half.read_bytes()) < 2 * len(whole.read_bytes())
     images = random_images(1, 3, 96, 128)
     belief, _ = PoseEstimator.load(half).network.maps(images)
     with torch.inference_mode():
@@ -151,13 +130,13 @@ def test_export_runs_on_the_cpu_only(original, tmp_path, monkeypatch):
 )
 def test_missing_extra_is_reported(layout, package, tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None if name == package else 1)
-    with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{layout}\]"):
+    message = rf"without the package {package}.*dopepp\[{layout}\]"
+    with pytest.raises(UserError, match=message):
         check_possible(layout, "fp32")
     if package != "onnxscript":
-        path = tmp_path / "a.onnx" if layout == "onnx" else tmp_path
         (tmp_path / "model.xml").touch()
-        with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{layout}\]"):
-            PoseEstimator.load(path)
+        with pytest.raises(UserError, match=message):
+            PoseEstimator.load(tmp_path / "a.onnx" if layout == "onnx" else tmp_path)
 
 
 @pytest.mark.parametrize("package", ["nncf", "openvino"])
@@ -166,6 +145,10 @@ def test_int8_of_onnx_requires_both_extras(package, monkeypatch):
     check_possible("onnx", "fp16")
     with pytest.raises(UserError, match=rf"int8 without the package {package}.*dopepp\[openvino\]"):
         check_possible("onnx", "int8")
+
+
+def cubed(values: torch.Tensor) -> torch.Tensor:  # torch reads the types
+    return values**3
 
 
 class Cubed(Backbone):
@@ -185,7 +168,7 @@ class Cubed(Backbone):
 def test_unsupported_operator_is_reported(layout, original, tmp_path, monkeypatch):
     pytest.importorskip("onnxscript" if layout == "onnx" else "openvino")
     if not hasattr(torch.ops.dopepp_test, "cubed"):
-        operator = torch.library.custom_op("dopepp_test::cubed", mutates_args=())(_cubed)
+        operator = torch.library.custom_op("dopepp_test::cubed", mutates_args=())(cubed)
         operator.register_fake(torch.empty_like)
     network, _ = load_network(original)
     network.backbone = Cubed()
@@ -195,10 +178,6 @@ def test_unsupported_operator_is_reported(layout, original, tmp_path, monkeypatc
     with pytest.raises(UserError, match=r"Cubed, Identity, .* cannot express") as e:
         EXPORTERS[layout][0](network.eval(), "fp32", ())
     assert "\n" not in str(e.value)
-
-
-def _cubed(values: torch.Tensor) -> torch.Tensor:
-    return values**3
 
 
 def test_threads(monkeypatch):

@@ -1,7 +1,5 @@
 """The next best view, and its expected error compared with sampled poses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,9 +19,7 @@ from dopepp.inference.several_views.next_view import next_best_view, point_error
 from dopepp.parts.catalogue import pivconnector
 
 K, SIZE = camera_matrix(600.0, 600.0, 319.5, 239.5), (640, 480)
-POSE = make_transform(
-    rotation_vector_to_matrix(np.array([2.9, 0.2, 0.3])), np.array([0.01, 0, 0.25])
-)
+POSE = move_pose(np.eye(4), np.array([2.9, 0.2, 0.3, 0.01, 0, 0.25]))
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +28,13 @@ def mesh():
     return make_outline_mesh(part.mesh.vertices, part.mesh.faces)
 
 
-def beside(degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> np.ndarray:
+def beside(degrees, axis=(0.0, 1.0, 0.0)):
     """Return T_world_cam of a camera rotated about the part by an angle."""
     turn = rotation_vector_to_matrix(math.radians(degrees) * np.array(axis))
     return invert_transform(make_transform(turn, POSE[:3, 3] - turn @ POSE[:3, 3]))
 
 
-def along_the_ray(millimetres: float) -> np.ndarray:
+def along_the_ray(millimetres):
     """Return the covariance of a pose with a large error along the viewing ray."""
     ray = POSE[:3, 3] / np.linalg.norm(POSE[:3, 3])
     covariance = np.diag(np.repeat([math.radians(0.2), 1e-4], 3) ** 2)
@@ -81,6 +77,5 @@ def test_point_error_is_the_rms_error_of_sampled_poses(mesh):
     draws = [move_pose(pose, spread @ rng.normal(size=6)) for _ in range(4000)]
     at = transform(pose, mesh.vertices)
     squares = [((transform(draw, mesh.vertices) - at) ** 2).sum(axis=1).mean() for draw in draws]
-    assert point_error(mesh, pose, covariance) == pytest.approx(
-        math.sqrt(np.mean(squares)), rel=0.05
-    )
+    expected = math.sqrt(np.mean(squares))
+    assert point_error(mesh, pose, covariance) == pytest.approx(expected, rel=0.05)

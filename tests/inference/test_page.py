@@ -1,19 +1,14 @@
 """The page of ``dopepp serve`` in a browser."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dopepp import PoseEstimator
 from dopepp.cli import app
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import pivconnector
@@ -33,7 +28,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Path:
+def files(tmp_path_factory):
     """Folder with an image of the part, an empty image, a text file and a camera file."""
     folder = tmp_path_factory.mktemp("files")
     rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
@@ -45,13 +40,12 @@ def files(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def opened() -> Iterator[tuple[object, list[str]]]:
+def opened(piv_estimator):
     """The open page, and the external addresses that it has requested."""
     from dopepp.inference.page import serve_page
 
-    elsewhere: list[str] = []
-    estimator = PoseEstimator.load("pretrained/pivconnector")
-    with serve_page(estimator) as address, sync_api.sync_playwright() as browsers:
+    elsewhere = []
+    with serve_page(piv_estimator) as address, sync_api.sync_playwright() as browsers:
         browser = browsers.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page()
         page.set_default_timeout(120_000)  # beside other work
@@ -108,10 +102,8 @@ def test_image_yields_an_overlay_and_the_json_of_predict(page, files, tmp_path):
         page.get_by_text("Download JSON").click()
     download.value.save_as(tmp_path / "poses.json")
     assert download.value.suggested_filename == "part.json"
-    options = ["--camera", str(files / "K.txt")]
-    done = CliRunner().invoke(
-        app, ["predict", "pretrained/pivconnector", str(files / "part.png"), *options]
-    )
+    words = "pretrained/pivconnector", str(files / "part.png"), "--camera", str(files / "K.txt")
+    done = CliRunner().invoke(app, ["predict", *words])
     predicted = [json.loads(line) | {"image": "part.png"} for line in done.stdout.splitlines()]
     assert len(predicted) == 1
     assert json.loads((tmp_path / "poses.json").read_text()) == predicted
@@ -141,13 +133,10 @@ def test_camera_of_another_image_size_is_reported(page, files):
     assert "likely of 201×201 (--K-size)" in message_of(page)
 
 
-def test_used_port_is_reported(page):
+def test_used_port_is_reported(page, piv_estimator):
     from dopepp.inference.page import serve_page
 
     port = int(page.url.rstrip("/").rsplit(":", 1)[1])
-    estimator = PoseEstimator.load("pretrained/pivconnector")
-    with (
-        pytest.raises(UserError, match=f"--port {port} already in use"),
-        serve_page(estimator, port),
-    ):
+    refused = pytest.raises(UserError, match=f"--port {port} already in use")
+    with refused, serve_page(piv_estimator, port):
         raise AssertionError

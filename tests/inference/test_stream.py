@@ -1,26 +1,16 @@
 """``estimator.stream``: detections, tracks and times on images and videos."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
-from dopepp.parts.catalogue import pivconnector
 
 
-@pytest.fixture(scope="module")
-def rendered():
-    from dopepp.virtual import PRESETS, Factory
-
-    return Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
-
-
-@pytest.fixture(scope="module")
-def K(rendered):  # noqa: N802
-    return rendered.scene.K
+@pytest.fixture
+def K(piv_render):  # noqa: N802
+    return piv_render.scene.K
 
 
 @pytest.fixture(scope="module")
@@ -29,20 +19,17 @@ def estimator():
 
 
 @pytest.fixture(scope="module")
-def clip(rendered, tmp_path_factory):
-    path = tmp_path_factory.mktemp("clip") / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240))
-    for shift in range(4):
-        writer.write(np.roll(rendered.image[..., ::-1], shift, axis=1))
-    writer.release()
-    return path
+def clip(piv_render, tmp_path_factory, write_clip):
+    shifted = [np.roll(piv_render.image, shift, axis=1) for shift in range(4)]
+    return write_clip(tmp_path_factory.mktemp("clip") / "clip.avi", shifted)
 
 
-def test_stream_of_an_image_equals_predict(estimator, rendered, K, tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), rendered.image[..., ::-1])
-    (expected,) = estimator.predict(rendered.image, K)
+def test_stream_of_an_image_equals_predict(estimator, piv_render, K, tmp_path):
+    image = piv_render.image
+    cv2.imwrite(str(tmp_path / "a.png"), image[..., ::-1])
+    (expected,) = estimator.predict(image, K)
     (result,) = estimator.stream(tmp_path / "a.png", K)
-    np.testing.assert_array_equal(result.image, rendered.image)
+    np.testing.assert_array_equal(result.image, image)
     np.testing.assert_allclose(result.detections[0].T_cam_obj, expected.T_cam_obj)
     assert result.name == str(tmp_path / "a.png")
     assert (result.time, result.identities) == (None, None)

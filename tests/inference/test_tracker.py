@@ -10,17 +10,13 @@ from dopepp.geometry.camera import make_transform, move_pose, project_keypoints,
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.motion import PERSISTENCE, SUDDEN, Motion, at_rest
-from dopepp.inference.tracker import (
-    FORGOTTEN,
-    OFTEN,
-    PATIENCE,
-    PoseTracker,
-)
+from dopepp.inference.tracker import FORGOTTEN, OFTEN, PATIENCE, PoseTracker
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
 
 K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
 IMAGE = np.zeros((480, 640, 3), np.uint8)
+PART = pivconnector()
 
 
 class Stage:
@@ -38,9 +34,8 @@ class Stage:
         self.agreement = self.network_agreement = 0.95
         self.min_score = 0.5
 
-    def put(self, name, part, position, turn=(0.0, 0.0, 0.0)):
-        pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(position))
-        self.actors[name] = part.name, pose
+    def put(self, name, position, turn=(0.0, 0.0, 0.0), part=PART):
+        self.actors[name] = part.name, move_pose(np.eye(4), np.array([*turn, *position]))
 
     def split(self, candidates):
         return PoseEstimator.split(self, candidates)
@@ -83,7 +78,7 @@ def stage():
 @pytest.fixture
 def tracker(stage):
     """A tracker after one frame with one part."""
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
     tracker = PoseTracker(stage)
     assert len(tracker.track(IMAGE, K)) == 1
     return tracker
@@ -100,7 +95,7 @@ def test_tracked_part_needs_the_network_only_when_due(stage):
     tracker = PoseTracker(stage, detect_every=10)
     for frame in range(30):
         angle = math.radians(8) * frame
-        stage.put("a", pivconnector(), (0.1 * math.sin(angle), 0.0, 0.3), (0.0, 0.0, angle))
+        stage.put("a", (0.1 * math.sin(angle), 0.0, 0.3), (0.0, 0.0, angle))
         (track,) = tracker.track(IMAGE, K)
         assert track.identity == 0
         assert track.detected == (frame == 0)
@@ -112,12 +107,12 @@ def test_steady_motion_is_predicted(stage):
     tracker = PoseTracker(stage)
     for frame in range(12):
         turn = (0.0, math.radians(6) * frame, 0.0)
-        stage.put("a", pivconnector(), (0.01 * frame, 0.0, 0.3), turn)
+        stage.put("a", (0.01 * frame, 0.0, 0.3), turn)
         (track,) = tracker.track(IMAGE, K)
     assert_allclose(track.velocity[:3], (0, math.radians(6), 0), atol=math.radians(1))
     assert_allclose(track.velocity[3:], (0.01, 0, 0), atol=0.002)
     before = stage.refinements
-    stage.put("a", pivconnector(), (0.12, 0.0, 0.3), (0.0, math.radians(72), 0.0))
+    stage.put("a", (0.12, 0.0, 0.3), (0.0, math.radians(72), 0.0))
     tracker.track(IMAGE, K)
     assert stage.refinements == before + 1  # the first prediction was accurate enough
 
@@ -128,7 +123,7 @@ def test_lost_part_is_searched_and_keeps_its_identity(stage, tracker):
         assert tracker.track(IMAGE, K) == []
     assert stage.looks == 8
     stage.hidden = set()
-    stage.put("a", pivconnector(), (0.08, 0.0, 0.4), (0.0, 0.0, 2.0))
+    stage.put("a", (0.08, 0.0, 0.4), (0.0, 0.0, 2.0))
     (track,) = tracker.track(IMAGE, K)
     assert (track.identity, track.detected) == (0, True)
     assert not track.velocity.any()
@@ -137,7 +132,7 @@ def test_lost_part_is_searched_and_keeps_its_identity(stage, tracker):
 
 
 def test_only_parts_above_the_threshold_are_tracked(stage):
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
     stage.min_score = 0.95
     tracker = PoseTracker(stage)
     assert tracker.track(IMAGE, K) == []
@@ -151,8 +146,8 @@ def test_only_parts_above_the_threshold_are_tracked(stage):
 
 def test_lost_part_is_forgotten(stage):
     tracker = PoseTracker(stage, detect_every=1_000_000)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
-    stage.put("b", servoholder(), (0.1, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
+    stage.put("b", (0.1, 0.0, 0.3), part=servoholder())
     tracker.track(IMAGE, K)
     stage.hidden = {"a"}
     for _ in range(FORGOTTEN + 2):
@@ -165,34 +160,35 @@ def test_lost_part_is_forgotten(stage):
 
 def test_equal_parts_keep_their_identities_when_one_reappears(stage):
     tracker = PoseTracker(stage, detect_every=5)
-    stage.put("left", pivconnector(), (-0.1, 0.0, 0.4))
-    stage.put("right", pivconnector(), (0.1, 0.0, 0.4))
-    positions = {
-        track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)
-    }
+    stage.put("left", (-0.1, 0.0, 0.4))
+    stage.put("right", (0.1, 0.0, 0.4))
+
+    def positions():
+        tracks = tracker.track(IMAGE, K)
+        return {track.identity: track.detection.T_cam_obj[0, 3] for track in tracks}
+
+    before = positions()
     stage.hidden = {"left"}
-    tracks = [tracker.track(IMAGE, K) for _ in range(4)][-1]
-    assert [item.detection.T_cam_obj[0, 3] for item in tracks] == [0.1]
+    assert [list(positions().values()) for _ in range(4)][-1] == [0.1]
     stage.hidden = set()
-    stage.put("third", pivconnector(), (0.0, 0.1, 0.4))
-    again = {track.identity: track.detection.T_cam_obj[0, 3] for track in tracker.track(IMAGE, K)}
-    assert again == {**positions, 2: 0.0}
+    stage.put("third", (0.0, 0.1, 0.4))
+    assert positions() == {**before, 2: 0.0}
 
 
 def test_sudden_motion_is_tracked_without_the_network(stage, tracker):
     for _ in range(4):
         tracker.track(IMAGE, K)
     stage.unknown_to_network = {"a"}
-    stage.put("a", pivconnector(), (0.015, 0.0, 0.3), (math.radians(8), 0.0, 0.0))
+    stage.put("a", (0.015, 0.0, 0.3), (math.radians(8), 0.0, 0.0))
     (track,) = tracker.track(IMAGE, K)
     assert not track.detected
-    stage.put("a", pivconnector(), (0.1, 0.0, 0.3))
+    stage.put("a", (0.1, 0.0, 0.3))
     assert tracker.track(IMAGE, K) == []
 
 
 def test_repeated_detections_elsewhere_move_the_track(stage):
     tracker = PoseTracker(stage, detect_every=5)
-    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("a", (0.0, 0.0, 0.3))
     tracker.track(IMAGE, K)
     true = stage.candidates
     turned = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.3]))
@@ -220,12 +216,12 @@ def test_track_moves_only_to_a_detection_that_agrees_better(stage, tracker):
 def test_doubtful_part_continues_its_motion(stage):
     tracker = PoseTracker(stage)
     for frame in range(10):
-        stage.put("a", pivconnector(), (0.005 * frame, 0.0, 0.3))
+        stage.put("a", (0.005 * frame, 0.0, 0.3))
         tracker.track(IMAGE, K)
     assert stage.looks == 1
     # A hand covers the part: half of the outline agrees, and the network detects nothing.
     stage.agreement, stage.unknown_to_network = 0.5, {"a"}
-    stage.put("a", pivconnector(), (0.047, 0.006, 0.3))
+    stage.put("a", (0.047, 0.006, 0.3))
     for number in range(1, PATIENCE + 1):
         (track,) = tracker.track(IMAGE, K)
         position = track.detection.T_cam_obj[:3, 3]
@@ -262,7 +258,7 @@ START = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), [0
 NOISE = np.repeat([math.radians(0.5), 0.0005], 3)
 
 
-def filtered(motion: Motion, T: np.ndarray) -> Motion:
+def filtered(motion, T):
     """Update a prediction by a pose measured with NOISE, as refinement fuses the two."""
     prior, measured = np.linalg.inv(motion.pose_covariance), np.diag(1 / NOISE**2)
     covariance = np.linalg.inv(prior + measured)
@@ -270,7 +266,7 @@ def filtered(motion: Motion, T: np.ndarray) -> Motion:
     return motion.update(move_pose(motion.T_cam_obj, step), covariance)
 
 
-def test_update_is_the_kalman_update() -> None:
+def test_update_is_the_kalman_update():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(12, 12)) * np.tile(NOISE, 2)[:, None]
     forecast = Motion(START, rng.normal(size=6) * 0.01, root @ root.T, np.zeros(6))
@@ -285,7 +281,7 @@ def test_update_is_the_kalman_update() -> None:
     assert_allclose(result.velocity, forecast.velocity + after[6:], atol=1e-9)
 
 
-def test_filter_predicts_a_steady_motion() -> None:
+def test_filter_predicts_a_steady_motion():
     step = np.array([0, math.radians(6), 0, 0.01, 0, 0])
     motion, T = at_rest(START, np.diag(NOISE**2), START[2, 3]), START
     for _ in range(15):
@@ -296,7 +292,7 @@ def test_filter_predicts_a_steady_motion() -> None:
     assert np.abs(miss[3:]).max() < 0.001
 
 
-def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
+def test_filter_reduces_the_jitter_of_a_part_at_rest():
     rng = np.random.default_rng(1)
     motion, steps = at_rest(START, np.diag(NOISE**2), START[2, 3]), []
     for _ in range(80):
@@ -309,7 +305,7 @@ def test_filter_reduces_the_jitter_of_a_part_at_rest() -> None:
 
 
 @pytest.mark.parametrize("sudden", [False, True])
-def test_prediction_is_slower_and_less_certain(sudden: bool) -> None:
+def test_prediction_is_slower_and_less_certain(sudden):
     motion = at_rest(START, np.diag(NOISE**2), START[2, 3])
     motion = Motion(START, np.array([0, 0, 0.02, 0.003, 0, 0]), motion.covariance, np.zeros(6))
     later = motion.predict(START[2, 3], sudden)

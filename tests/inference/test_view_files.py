@@ -1,7 +1,5 @@
 """Files of camera poses in three formats, written here by independent code."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -62,11 +60,9 @@ def test_camera_of_all_views_or_of_a_single_view(tmp_path):
         "a.png": {"T_world_cam": FORMS[0]},
         "b.png": {"T_world_cam": FORMS[1], "camera": "two.txt"},
     }
-    path = tmp_path / "views.yaml"
-    path.write_text(
-        yaml.safe_dump({"camera": "one.txt", "camera_error": [3e-4, 0.05], "views": views})
-    )
-    poses = read_camera_poses(path)
+    content = {"camera": "one.txt", "camera_error": [3e-4, 0.05], "views": views}
+    (tmp_path / "views.yaml").write_text(yaml.safe_dump(content))
+    poses = read_camera_poses(tmp_path / "views.yaml")
     assert poses.error == pytest.approx((3e-4, np.radians(0.05)))
     first, second = poses.of(tmp_path / "a.png"), poses.of(tmp_path / "b.png")
     assert (first.camera.K[0, 0], second.camera.K[0, 0]) == (600, 700)
@@ -78,11 +74,9 @@ def test_camera_of_all_views_or_of_a_single_view(tmp_path):
 def test_flange_poses_require_the_hand_eye_result(tmp_path):
     T_flange_cam = np.eye(4)
     T_flange_cam[:3, 3] = 0.01, 0.02, 0.03
-    (tmp_path / "hand_eye.yaml").write_text(
-        yaml.safe_dump({"T_flange_cam": {"matrix": T_flange_cam.tolist()}})
-    )
-    path = tmp_path / "views.yaml"
-    views = {"a.png": {"T_base_flange": FORMS[0]}}
+    hand_eye = {"T_flange_cam": {"matrix": T_flange_cam.tolist()}}
+    (tmp_path / "hand_eye.yaml").write_text(yaml.safe_dump(hand_eye))
+    path, views = tmp_path / "views.yaml", {"a.png": {"T_base_flange": FORMS[0]}}
     path.write_text(yaml.safe_dump({"hand_eye": "hand_eye.yaml", "views": views}))
     pose = read_camera_poses(path).of(tmp_path / "a.png")
     assert_allclose(pose.T_world_cam, T_WORLD_CAM @ T_flange_cam, atol=1e-12)

@@ -1,41 +1,34 @@
 """Contents of Rerun recordings, and errors of the viewer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.viewer import Viewer, belief_images
-from dopepp.parts.catalogue import pivconnector
 
 rerun = pytest.importorskip("rerun")
 
 
-@pytest.fixture(scope="module")
-def estimator():
-    return PoseEstimator.load("pretrained/pivconnector")
+@pytest.fixture
+def estimator(piv_estimator):
+    return piv_estimator
 
 
 @pytest.fixture(scope="module")
-def result(estimator):
-    from dopepp.virtual import PRESETS, Factory
-
-    item = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
-    shapes = {part.name: make_shape(part) for part in estimator.parts}
-    detections = estimator.predict(item.image, item.scene.K)
+def result(piv_estimator, piv_render):
+    image, K = piv_render.image, piv_render.scene.K
+    shapes = {part.name: make_shape(part) for part in piv_estimator.parts}
+    detections = piv_estimator.predict(image, K)
     assert detections
-    return PoseResult(item.image, item.scene.K, detections, {}, "clip.mp4", 3, 0.3, shapes=shapes)
+    return PoseResult(image, K, detections, {}, "clip.mp4", 3, 0.3, shapes=shapes)
 
 
 def test_recording_contains_every_entity(estimator, result, tmp_path):
     path = tmp_path / "new" / "out.rrd"
     with Viewer(estimator, path) as viewer:
         viewer.write(result)
-        nothing = PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4)
-        viewer.write(nothing)
+        viewer.write(PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4))
         assert not path.exists()
     assert [file.name for file in path.parent.iterdir()] == ["out.rrd"]
     chunks = rerun.chunk.RrdReader(path).stream().to_chunks()

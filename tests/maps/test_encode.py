@@ -9,24 +9,20 @@ from dopepp.maps import MapGeometry, encode
 GEOMETRY = MapGeometry(stride=8, sigma=1.3, field_radius=2.5)
 
 
-def by_hand(
-    keypoints: np.ndarray, objects: np.ndarray, count: int, size: tuple[int, int], g: MapGeometry
-) -> tuple[np.ndarray, np.ndarray]:
+def by_hand(keypoints, objects, count, size):
     """Compute the maps cell by cell from their definition."""
-    height, width = size
+    (height, width), g = size, GEOMETRY
     beliefs = np.zeros((len(keypoints), 9 * count, height, width))
     fields = np.zeros((len(keypoints), 16 * count, height, width))
     for b, i, j in np.ndindex(len(keypoints), height, width):
         cell = np.array([g.stride * j, g.stride * i]) + (g.stride - 1) / 2
-        nearest: dict[int, float] = {}
+        nearest = {}
         for c, points in zip(objects[b], keypoints[b], strict=True):
             if c < 0:
                 continue
             for k in range(9):
-                inside = (points[k] > -0.5) & (
-                    points[k] < np.array([width, height]) * g.stride - 0.5
-                )
-                if not inside.all():
+                border = np.array([width, height]) * g.stride - 0.5
+                if not ((points[k] > -0.5) & (points[k] < border)).all():
                     continue
                 distance = math.dist(cell, points[k]) / g.stride
                 value = math.exp(-(distance**2) / (2 * g.sigma**2))
@@ -53,7 +49,7 @@ def test_maps_agree_with_their_definition():
     keypoints[2, 2, :5] = [[np.nan, 40], [np.inf, 40], [-0.6, 40], [40, 88], [1e30, 0]]
     keypoints[2, 2, 5:7] = [[-0.4, 40], [40, 87.4]]
     objects = np.array([[0, 0, 1, -1], [1, 1, 1, 0], [-1, -1, 0, 1]])
-    expected = by_hand(keypoints, objects, 2, (11, 15), GEOMETRY)
+    expected = by_hand(keypoints, objects, 2, (11, 15))
     result = encode(torch.tensor(keypoints), torch.tensor(objects), 2, (11, 15), GEOMETRY)
     for ours, theirs in zip(result, expected, strict=True):
         assert ours.dtype == torch.float32

@@ -3,32 +3,29 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import maximum_filter
-from torch import Tensor
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import random_rotation
-from dopepp.maps import MapGeometry, Peaks, encode, find_peaks
+from dopepp.maps import MapGeometry, encode, find_peaks
 
 GEOMETRY = MapGeometry(stride=8, sigma=1.0)
 NUM_CELLS = 30
 
 
-def gaussians(
-    *centres: tuple[float, float], sigma: float = 1.0, height: float = 1.0, cells: int = NUM_CELLS
-) -> Tensor:
+def gaussians(*centres, sigma=1.0, height=1.0):
     """One channel with the maximum of Gaussians at (x, y) in cells."""
-    y, x = torch.meshgrid(torch.arange(cells), torch.arange(cells), indexing="ij")
-    belief = torch.zeros(cells, cells)
+    y, x = torch.meshgrid(*[torch.arange(NUM_CELLS)] * 2, indexing="ij")
+    belief = torch.zeros(NUM_CELLS, NUM_CELLS)
     for cx, cy in centres:
         squared = (x - cx) ** 2 + (y - cy) ** 2
         belief = torch.maximum(belief, height * torch.exp(-squared / (2 * sigma**2)))
     return belief[None, None]
 
 
-def positions(peaks: Peaks, channel: int = 0) -> np.ndarray:
-    """Return the peaks of the first image's channel in cells, (n, 2)."""
-    found = peaks.position[0, channel][peaks.score[0, channel] > 0]
+def positions(peaks):
+    """Return the peaks of the first image's first channel in cells, (n, 2)."""
+    found = peaks.position[0, 0][peaks.score[0, 0] > 0]
     return np.asarray((found - 3.5) / 8)
 
 
@@ -40,21 +37,10 @@ def test_decoding_an_encoded_pose_finds_its_keypoints(sigma):
     cuboid = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))
     K = camera_matrix(400, 400, 127.5, 127.5)
     low, high = [-0.12, -0.12, 0.25], [0.12, 0.12, 0.5]
-    keypoints = np.stack(
-        [
-            project_keypoints(
-                cuboid, make_transform(random_rotation(rng), rng.uniform(low, high)), K
-            )
-            for _ in range(150)
-        ]
-    )
-    belief, _ = encode(
-        torch.tensor(keypoints)[:, None],
-        torch.zeros(len(keypoints), 1, dtype=torch.long),
-        1,
-        (32, 32),
-        geometry,
-    )
+    poses = [make_transform(random_rotation(rng), rng.uniform(low, high)) for _ in range(150)]
+    keypoints = np.stack([project_keypoints(cuboid, T, K) for T in poses])
+    objects = torch.zeros(len(keypoints), 1, dtype=torch.long)
+    belief, _ = encode(torch.tensor(keypoints)[:, None], objects, 1, (32, 32), geometry)
     peaks = find_peaks(belief, geometry)
     on_map = ((keypoints > -0.5) & (keypoints < 255.5)).all(-1)
     assert on_map.mean() < 0.99  # some are off the map
@@ -86,7 +72,7 @@ def test_a_clamped_belief_has_one_peak_in_the_middle_of_its_top(height, sigma):
     """The activation clamps beliefs at 1; the flanks still determine the position."""
     rng = np.random.default_rng(1)
     for centre in rng.uniform(5, 25, (40, 2)):
-        belief = gaussians((centre[0], centre[1]), sigma=sigma, height=height).clamp(max=1)
+        belief = gaussians(centre, sigma=sigma, height=height).clamp(max=1)
         found = positions(find_peaks(belief, GEOMETRY))
         assert len(found) == 1
         assert 8 * np.linalg.norm(found[0] - centre) < 0.5
@@ -104,9 +90,8 @@ PLATEAUS = {
 }
 
 
-@pytest.mark.parametrize("name", PLATEAUS)
-def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(name):
-    shape = PLATEAUS[name]
+@pytest.mark.parametrize("shape", PLATEAUS.values(), ids=PLATEAUS)
+def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(shape):
     belief = torch.zeros(1, 1, NUM_CELLS, NUM_CELLS)
     belief[0, 0, 10 : 10 + shape.shape[0], 12 : 12 + shape.shape[1]] = shape
     found = positions(find_peaks(belief, GEOMETRY))
@@ -128,11 +113,10 @@ def test_steps_of_a_coarse_number_format_are_not_peaks():
 def test_the_peaks_of_two_instances_are_independent(sigma, apart):
     rng = np.random.default_rng(2)
     geometry = MapGeometry(8, sigma)
-    for first, turn in zip(
-        rng.uniform(13, 17, (60, 2)), rng.uniform(0, 2 * np.pi, 60), strict=True
-    ):
+    turns = rng.uniform(0, 2 * np.pi, 60)
+    for first, turn in zip(rng.uniform(13, 17, (60, 2)), turns, strict=True):
         second = first + apart * sigma * np.array([np.cos(turn), np.sin(turn)])
-        belief = gaussians((first[0], first[1]), (second[0], second[1]), sigma=sigma)
+        belief = gaussians(first, second, sigma=sigma)
         found = positions(find_peaks(belief, geometry))
         assert len(found) == 2
         for truth in (first, second):
@@ -148,9 +132,8 @@ def test_a_weak_peak_beside_a_strong_one():
 
 def test_noise_on_a_peak_moves_it_little():
     rng = torch.Generator().manual_seed(0)
-    belief = gaussians((14.3, 15.6)) + 0.02 * torch.randn(
-        1, 200, NUM_CELLS, NUM_CELLS, generator=rng
-    )
+    noise = torch.randn(1, 200, NUM_CELLS, NUM_CELLS, generator=rng)
+    belief = gaussians((14.3, 15.6)) + 0.02 * noise
     peaks = find_peaks(belief, GEOMETRY, threshold=0.3, max_peaks=1)
     error = (peaks.position[0, :, 0] - 3.5) / 8 - np.array([14.3, 15.6])
     assert (peaks.score > 0).all()
@@ -225,9 +208,8 @@ def test_the_covariance_of_a_blurred_peak(noise):
 def test_the_vector_is_the_mean_of_its_disc():
     rng, generator = np.random.default_rng(6), torch.Generator().manual_seed(6)
     keypoints = torch.tensor(rng.uniform(20, 220, (40, 1, 9, 2)))
-    belief, field = encode(
-        keypoints, torch.zeros(40, 1, dtype=torch.long), 1, (NUM_CELLS, NUM_CELLS), GEOMETRY
-    )
+    objects = torch.zeros(40, 1, dtype=torch.long)
+    belief, field = encode(keypoints, objects, 1, (NUM_CELLS, NUM_CELLS), GEOMETRY)
     field = field + 0.05 * torch.randn(field.shape, generator=generator)
     peaks = find_peaks(belief, GEOMETRY, threshold=0.3, max_peaks=1, field=field)
     toward = keypoints[:, 0, 8:] - keypoints[:, 0, :8]

@@ -1,6 +1,6 @@
 """BOP's scores, against plain loops over BOP's definitions."""
 
-from dataclasses import dataclass, replace
+from dataclasses import make_dataclass, replace
 
 import numpy as np
 import pytest
@@ -21,25 +21,21 @@ HALF = np.array([0.04, 0.03, 0.02])
 HALF_TURN = make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
 
-def part(**changes) -> Part:
+def part(**changes):
     corners = cuboid_keypoints(-HALF, HALF)
     made = Part("box", corners, 2 * float(np.linalg.norm(HALF)), corners[:8])
     return replace(made, **changes)
 
 
-@dataclass
-class Pose:
-    object: str
-    score: float
-    T_cam_obj: np.ndarray
+Pose = make_dataclass("Pose", ["object", "score", "T_cam_obj"])
 
 
-def pose(x=0.0, turn=0.0, z=0.5) -> np.ndarray:
+def pose(x=0.0, turn=0.0, z=0.5):
     rotation = Rotation.from_euler("z", turn, degrees=True).as_matrix()
     return make_transform(rotation, np.array([x, 0.0, z]))
 
 
-def truth(T, visible=1.0, wanted=None) -> Instance:
+def truth(T, visible=1.0, wanted=None):
     return Instance("box", T, np.zeros((9, 2)), visible, wanted=wanted)
 
 
@@ -113,15 +109,9 @@ def scores(images, of=None, depth=None, draw=None):
 
 
 def test_recalls_by_hand():
-    diameter = part().diameter
-    shift = 0.22 * diameter  # passes 0.25 … 0.5 of ten thresholds: six
-    result = scores(
-        [
-            ([Pose("box", 0.9, pose(shift))], [truth(pose())]),
-            ([], [truth(pose())]),
-            ([Pose("box", 0.1, pose())], [truth(pose())]),
-        ]
-    )
+    shift = 0.22 * part().diameter  # passes 0.25 … 0.5 of ten thresholds: six
+    found = [[Pose("box", 0.9, pose(shift))], [], [Pose("box", 0.1, pose())]]
+    result = scores([(detections, [truth(pose())]) for detections in found])
     assert (result.num_targets, result.ar_vsd, result.ar) == (3, None, None)
     assert result.ar_mssd == pytest.approx((0.6 + 0 + 1) / 3)
     pixels = K[0, 0] * shift / (0.5 - HALF[2]) * 640 / SIZE[0]  # of the nearest corner
@@ -132,8 +122,7 @@ def test_recalls_by_hand():
 
 
 def test_targets_are_listed_or_visible_and_limit_the_number_of_estimates():
-    away = Pose("box", 0.9, pose(0.3))
-    right = Pose("box", 0.5, pose())
+    away, right = Pose("box", 0.9, pose(0.3)), Pose("box", 0.5, pose())
     item = [truth(pose())]
     # One target: only the estimate with the best score counts, not the nearest.
     assert scores([([right, away], item)]).add_or_s_01d == 0

@@ -1,12 +1,9 @@
 """Two gloo processes compute the same numbers as one process, also if a rank has no images."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 from collections import namedtuple
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,16 +19,13 @@ NUM_IMAGES = 13
 Detection = namedtuple("Detection", ["object", "score", "T_cam_obj", "covariance"], defaults=[None])
 
 
-def metric() -> PoseMetrics:
+def measured(images):
+    """Add images to a metric: every third is missed, and every second has a duplicate."""
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (100, 3)) * [1, 0.6, 0.2]
     cuboid = cuboid_keypoints(points.min(0), points.max(0))
     turning = (((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),)
     box = Part("box", cuboid, 0.12, points, symmetries_continuous=turning)
-    return PoseMetrics([box, Part("none", cuboid, 0.12, points)])
-
-
-def feed(target: PoseMetrics, images: range) -> None:
-    """Add images: every third is missed, and every second has a duplicate."""
+    metric = PoseMetrics([box, Part("none", cuboid, 0.12, points)])
     for i in images:
         rng = np.random.default_rng(i)
         T = np.eye(4)
@@ -43,16 +37,10 @@ def feed(target: PoseMetrics, images: range) -> None:
         result = Detection("box", 0.5 + 0.1 * (i % 2), E)
         detections = [] if i % 3 == 0 else [result] * (1 + i % 2)
         K = np.array([[500.0 + i, 0, 320], [0, 500, 240], [0, 0, 1]])
-        target.update(detections, [Instance("box", T, np.zeros((9, 2)))], K, 640 + 10 * i)
-
-
-def summary(source: PoseMetrics) -> dict[str, object]:
-    references = source.references()
-    return {
-        "rows": {name: asdict(row) for name, row in source.compute().items()},
-        "errors": sorted(source.errors("box").tolist()),
-        "references": {reference: asdict(rows["box"]) for reference, rows in references.items()},
-    }
+        metric.update(detections, [Instance("box", T, np.zeros((9, 2)))], K, 640 + 10 * i)
+    references = {name: asdict(rows["box"]) for name, rows in metric.references().items()}
+    rows = {name: asdict(row) for name, row in metric.compute().items()}
+    return {"rows": rows, "errors": sorted(metric.errors("box").tolist()), "references": references}
 
 
 SPLITS = {
@@ -61,13 +49,9 @@ SPLITS = {
 }
 
 
-def run_rank(rank: int, folder: Path) -> None:
+def run_rank(rank, folder):
     dist.init_process_group("gloo", f"file://{folder / 'store'}", rank=rank, world_size=2)
-    results = {}
-    for split, shares in SPLITS.items():
-        target = metric()
-        feed(target, shares[rank])
-        results[split] = summary(target)
+    results = {split: measured(shares[rank]) for split, shares in SPLITS.items()}
     (folder / f"{rank}.json").write_text(json.dumps(results))
     dist.destroy_process_group()
 
@@ -78,9 +62,7 @@ def test_two_processes_compute_the_numbers_of_one_process(tmp_path):
     ranks = [fork.Process(target=run_rank, args=(rank, tmp_path)) for rank in range(2)]
     for process in ranks:
         process.start()
-    alone = metric()
-    feed(alone, range(NUM_IMAGES))
-    expected = json.loads(json.dumps(summary(alone)))
+    expected = json.loads(json.dumps(measured(range(NUM_IMAGES))))
     for process in ranks:
         process.join(120)
         assert process.exitcode == 0

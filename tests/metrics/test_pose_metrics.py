@@ -1,7 +1,5 @@
 """The accumulator: matching, counting, rates, and cases without instances or detections."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -12,7 +10,6 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -25,36 +22,40 @@ from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow, shown_columns
 from dopepp.parts.part import Mesh, Part
 
-Array = NDArray[np.float64]
-
+K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 Detection = namedtuple("Detection", ["object", "score", "T_cam_obj", "covariance"], defaults=[None])
 
 
-def part(name: str, seed: int = 0) -> Part:
+def part(name, seed=0):
     points = np.random.default_rng(seed).uniform(-0.05, 0.05, (200, 3)) * [1, 0.6, 0.2]
     return Part(name, cuboid_keypoints(points.min(0), points.max(0)), 0.12, points)
 
 
-def pose(x: float = 0.0, rotvec: tuple[float, float, float] = (0, 0, 0)) -> Array:
+def pose(x=0.0, rotvec=(0, 0, 0)):
     return make_transform(Rotation.from_rotvec(rotvec).as_matrix(), np.array([x, 0, 0.6]))
 
 
-def truth(name: str, T: Array, visible: float = 1.0) -> Instance:
+def truth(name, T, visible=1.0):
     return Instance(name, T, np.zeros((9, 2)), visible)
 
 
-K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+def measured(*images, of=None):
+    """Return the metric for one part of images, each with detections and instances."""
+    metric = PoseMetrics([of or part("box")])
+    for image in images:
+        metric.update(*image)
+    return metric
 
 
 def test_errors_are_compared_with_estimated_covariances():
     rng = np.random.default_rng(1)
     deviation = np.array([0.02, 0.01, 0.01, 0.002, 0.002, 0.005])
-    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
-    metric = PoseMetrics([replace(part("box"), symmetries_discrete=flip[None])])
+    metric = PoseMetrics([replace(part("box"), symmetries_discrete=FLIP[None])])
     for number in range(1500):
         T = pose(0, tuple(rng.normal(size=3)))
         estimate = move_pose(T, 3 * deviation * rng.normal(size=6))
-        estimate = estimate @ flip if number % 2 else estimate
+        estimate = estimate @ FLIP if number % 2 else estimate
         metric.update([Detection("box", 1, estimate, np.diag(deviation**2))], [truth("box", T)])
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
     inside = chi2.cdf(chi2.ppf(0.9, 6) / 9, 6)
@@ -62,8 +63,7 @@ def test_errors_are_compared_with_estimated_covariances():
     assert metric.compute()[MEAN].median_deviations == pytest.approx(3, rel=0.05)
     metric.update([], [truth("box", pose())])  # a miss has no covariance
     assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
-    file = PoseMetrics([part("box")])
-    file.update([Detection("box", 1, pose(0.01))], [truth("box", pose())])
+    file = measured(([Detection("box", 1, pose(0.01))], [truth("box", pose())]))
     row = file.compute()["box"]
     assert (row.median_deviations, row.coverage) == (None, None)
 
@@ -71,7 +71,7 @@ def test_errors_are_compared_with_estimated_covariances():
 def test_rows_agree_with_the_functions():
     """For a symmetric part on images of two sizes; most estimates are rotated by the symmetry."""
     rng = np.random.default_rng(3)
-    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned = FLIP.copy()
     turned[:3, 3] = [0.002, 0.0, 0.0]
     box = replace(part("box"), symmetries_discrete=turned[None])
     metric = PoseMetrics([box])
@@ -82,9 +82,8 @@ def test_rows_agree_with_the_functions():
         T = pose(rng.normal(0, 0.05), tuple(rng.normal(size=3)))
         E = (T @ turned if number % 3 else T) @ pose(0, tuple(rng.normal(0, 0.01, 3)))
         E[:3, 3] = T[:3, 3] + rng.normal(0, 0.01, 3)
-        metric.update(
-            [Detection("box", 0.9, E)], [truth("box", T)], cameras[number], widths[number]
-        )
+        found = [Detection("box", 0.9, E)]
+        metric.update(found, [truth("box", T)], cameras[number], widths[number])
         estimates.append(E)
         truths.append(T)
     est, gt = (torch.from_numpy(np.stack(x)) for x in (estimates, truths))
@@ -96,6 +95,7 @@ def test_rows_agree_with_the_functions():
     pixels = mspd(*split, points, torch.from_numpy(cameras), group) * 640 / torch.from_numpy(widths)
     shares, steps = np.arange(1, 11) * 0.05, np.arange(1, 11) * 5.0
     relative = Rotation.from_matrix(split[0]) * Rotation.from_matrix(split[2]).inv()
+    angles, distances = np.degrees(relative.magnitude()), torch.norm(split[1] - split[3], dim=1)
     row = metric.compute()["box"]
     assert row == replace(
         PoseRow("box", "estimate", 30, miss_rate=0.0, false_per_frame=0.0),
@@ -113,12 +113,10 @@ def test_rows_agree_with_the_functions():
         add_or_s_01d=pass_rate(errors_s, 0.012),
         auc_or_s_10cm=pytest.approx(auc(errors_s, 0.1), rel=1e-12),
         pass_5cm_5deg=1.0,
-        median_rotation_deg=pytest.approx(np.median(np.degrees(relative.magnitude())), rel=1e-9),
-        median_translation=pytest.approx(np.median(np.linalg.norm(split[1] - split[3], axis=1))),
-        p90_rotation_deg=pytest.approx(np.percentile(np.degrees(relative.magnitude()), 90)),
-        p90_translation=pytest.approx(
-            np.percentile(np.linalg.norm(split[1] - split[3], axis=1), 90)
-        ),
+        median_rotation_deg=pytest.approx(np.median(angles), rel=1e-9),
+        median_translation=pytest.approx(np.median(distances)),
+        p90_rotation_deg=pytest.approx(np.percentile(angles, 90)),
+        p90_translation=pytest.approx(np.percentile(distances, 90)),
         average_precision=row.average_precision,
         mssd_01d=pass_rate(surface, 0.012),
         ar_mssd=pytest.approx(np.mean([pass_rate(surface, s * 0.12) for s in shares])),
@@ -128,7 +126,6 @@ def test_rows_agree_with_the_functions():
         ),
         num_symmetries=2,
     )
-    assert row.ar_mspd is not None
     assert 0 < row.ar_mspd < 1
     assert metric.compute()[MEAN] == replace(row, object=MEAN)
     np.testing.assert_allclose(metric.errors("box"), errors, rtol=1e-12)
@@ -144,10 +141,8 @@ def test_rows_agree_with_the_functions():
         ([(0.9, pose(0)), (0.2, pose(0.03))], [(0, 1)], (1, 1, 0.5, 0), [0]),
         # Farther than half the diameter, or no pose at all: a miss and a false positive.
         ([(0.9, pose(0.061))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
-        *(
-            ([(0.9, np.full((4, 4), bad))], [(0, 1)], (1, 1, 0, 1), [math.inf])
-            for bad in (math.nan, math.inf)
-        ),
+        ([(0.9, np.full((4, 4), math.nan))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
+        ([(0.9, np.full((4, 4), math.inf))], [(0, 1)], (1, 1, 0, 1), [math.inf]),
         # A hardly visible instance neither counts nor makes a false positive …
         ([(0.9, pose(0.3))], [(0, 0.1), (0.3, 0.0999)], (1, 0, None, 1), [math.inf]),
         # … but a second detection at its position is a false positive.
@@ -157,9 +152,8 @@ def test_rows_agree_with_the_functions():
     ],
 )
 def test_detections_are_matched_with_instances(detections, truths, counts, errors):
-    metric = PoseMetrics([part("box")])
-    instances = [truth("box", pose(x), visible) for x, visible in truths]
-    metric.update([Detection("box", score, T) for score, T in detections], instances)
+    found = [Detection("box", score, T) for score, T in detections]
+    metric = measured((found, [truth("box", pose(x), visible) for x, visible in truths]))
     row = metric.compute()["box"]
     assert (row.num_instances, row.false_per_frame, row.precision, row.miss_rate) == counts
     assert metric.errors("box") == pytest.approx(errors)
@@ -168,10 +162,9 @@ def test_detections_are_matched_with_instances(detections, truths, counts, error
 
 @pytest.mark.parametrize(("diameter", "radius"), [(0.038, 0.019), (0.2, 0.1), (1.5, 0.1)])
 def test_a_detection_matches_within_half_a_diameter_and_ten_centimetres(diameter, radius):
-    metric = PoseMetrics([replace(part("box"), diameter=diameter)])
-    for offset in (0.999 * radius, 1.001 * radius):
-        metric.update([Detection("box", 1, pose(offset))], [truth("box", pose())])
-    row = metric.compute()["box"]
+    near_and_far = ([Detection("box", 1, pose(x * radius))] for x in (0.999, 1.001))
+    images = [(found, [truth("box", pose())]) for found in near_and_far]
+    row = measured(*images, of=replace(part("box"), diameter=diameter)).compute()["box"]
     assert (row.matching_radius, row.miss_rate) == (radius, 0.5)
 
 
@@ -179,16 +172,14 @@ def test_the_distance_of_a_match_is_between_centres():
     # The origin is half a metre from the part, so a small rotation moves the centre far away.
     points = np.random.default_rng(0).uniform([0.45, -0.05, -0.05], [0.55, 0.05, 0.05], (50, 3))
     far = Part("far", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
-    metric = PoseMetrics([far])
-    metric.update([Detection("far", 1, pose(0, (0, 0, 0.4)))], [truth("far", pose())])
-    assert metric.compute()["far"].miss_rate == 1
+    turned = [Detection("far", 1, pose(0, (0, 0, 0.4)))]
+    assert measured((turned, [truth("far", pose())]), of=far).compute()["far"].miss_rate == 1
 
 
 def test_objects_do_not_match_each_other():
     metric = PoseMetrics([part("a"), part("b")])
-    with pytest.raises(
-        UserError, match="got a detection of 'c'; allowed: detections of the evaluated"
-    ):
+    other = "got a detection of 'c'; allowed: detections of the evaluated"
+    with pytest.raises(UserError, match=other):
         metric.update([Detection("c", 1, pose())], [])
     metric.update([Detection("a", 0.9, pose())], [truth("b", pose()), truth("other", pose())])
     rows = metric.compute()
@@ -207,22 +198,18 @@ def test_misses_give_zero_and_an_empty_metric_gives_none():
     metric = PoseMetrics([part("box")])
     for row in metric.compute().values():
         assert row == PoseRow(row.object, "estimate", num_instances=0, false_per_frame=0)
-    for _ in range(3):
-        metric.update([], [truth("box", pose())])
-    row = metric.compute()["box"]
     zeros = ("add_01d", "add_005d", "add_002d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d",
              "auc_s_10cm", "average_precision", "mssd_01d", "ar_mssd",
              "add_or_s_01d", "auc_or_s_10cm", "pass_5cm_5deg")  # fmt: skip
     expected = PoseRow("box", "estimate", 3, matching_radius=0.06, miss_rate=1.0, false_per_frame=0)
-    assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
+    missed = measured(*[([], [truth("box", pose())])] * 3)
+    assert missed.compute()["box"] == replace(expected, **dict.fromkeys(zeros, 0.0))
 
 
 def test_the_mean_excludes_objects_without_ground_truth():
     metric = PoseMetrics([part("a"), part("b"), part("c")])
-    metric.update(
-        [Detection("a", 1, pose()), Detection("c", 1, pose())],
-        [truth("a", pose()), truth("b", pose())],
-    )
+    found = [Detection("a", 1, pose()), Detection("c", 1, pose())]
+    metric.update(found, [truth("a", pose()), truth("b", pose())])
     rows = metric.compute()
     assert rows["c"].add_01d is None
     cells = {column.heading: column.text(rows["c"]) for column in shown_columns(rows["c"])}
@@ -234,8 +221,7 @@ def test_the_mean_excludes_objects_without_ground_truth():
 
 
 def test_reset_pickle_and_copy():
-    metric = PoseMetrics([part("box")])
-    metric.update([Detection("box", 0.9, pose(0.01))], [truth("box", pose())])
+    metric = measured(([Detection("box", 0.9, pose(0.01))], [truth("box", pose())]))
     for twin in (copy.deepcopy(metric), pickle.loads(pickle.dumps(metric))):
         assert twin.compute() == metric.compute()
     metric.reset()
@@ -259,16 +245,16 @@ def test_references_use_the_instances_that_count():
 def test_mssd_uses_the_vertices_of_a_mesh():
     vertices = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0]])
     box = replace(part("box"), mesh=Mesh(vertices, np.array([[0, 1, 2]], np.int32)))
-    metric = PoseMetrics([box])
-    metric.update([Detection("box", 1, pose(0, (0, 0, 0.2)))], [truth("box", pose())])
+    turned = [Detection("box", 1, pose(0, (0, 0, 0.2)))]
+    metric = measured((turned, [truth("box", pose())]), of=box)
     assert metric.errors("box", "mssd") == pytest.approx([2 * np.sin(0.1) * 0.1])
 
 
 def test_mspd_needs_every_camera():
-    metric = PoseMetrics([part("box")])
-    metric.update([Detection("box", 1, pose())], [truth("box", pose())], K, 640)
+    image = [Detection("box", 1, pose())], [truth("box", pose())]
+    metric = measured((*image, K, 640))
     assert metric.compute()["box"].ar_mspd == 1
-    metric.update([Detection("box", 1, pose())], [truth("box", pose())])
+    metric.update(*image)
     assert metric.compute()["box"].ar_mspd is None
     for camera, width in ((K, None), (None, 640), (K[:2], 640), (K * np.nan, 640), (K, 0)):
         with pytest.raises(ValueError, match="K must be"):
@@ -306,11 +292,9 @@ def test_average_precision_by_hand(images, expected):
 
 def test_precision_and_false_detections_count_in_frames():
     """Ten images with six correct poses and one wrong pose, and two detections without the part."""
-    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
-    box = replace(part("box"), symmetries_discrete=turned[None])
-    metric = PoseMetrics([box])
+    metric = PoseMetrics([replace(part("box"), symmetries_discrete=FLIP[None])])
     for number in range(10):
-        result = [] if number > 6 else [Detection("box", 0.9, pose() @ turned)]
+        result = [] if number > 6 else [Detection("box", 0.9, pose() @ FLIP)]
         truths = [truth("box", pose(0.058 if number == 6 else 0))] if number < 9 else []
         metric.update(result, truths)
     metric.update([Detection("box", s, pose()) for s in (0.5, 0.4)], [])
@@ -320,10 +304,8 @@ def test_precision_and_false_detections_count_in_frames():
 
 
 def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not():
-    metric = PoseMetrics([part("box")])
-    twice = [Detection("box", s, pose()) for s in (0.9, 0.8)]
-    metric.update(twice, [truth("box", pose())])
-    metric.update([Detection("box", 0.7, pose())], [truth("box", pose())])
+    twice, once = ([Detection("box", s, pose()) for s in scores] for scores in ((0.9, 0.8), (0.7,)))
+    metric = measured((twice, [truth("box", pose())]), (once, [truth("box", pose())]))
     # Right, wrong, right: precision 1 up to recall 0.5, then 2/3.
     expected = (51 + 50 * 2 / 3) / 101
     assert metric.compute()["box"].average_precision == pytest.approx(expected)
@@ -335,8 +317,7 @@ def test_plot_shows_one_curve_per_object():
     metric = PoseMetrics([part("a"), part("b")], method="DOPE++")
     metric.update([Detection("a", 1, pose(0.05))], [truth("a", pose()), truth("b", pose())])
     figure, axes = metric.plot()
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["a (AUC 50.0 %)", "b (AUC 0.0 %)"]
     assert figure.axes == [axes]
-    labels = [text.get_text() for text in metric.plot("mssd")[1].get_legend().get_texts()]
-    assert labels == ["a (AUC 50.0 %)", "b (AUC 0.0 %)"]
+    for legend in (axes.get_legend(), metric.plot("mssd")[1].get_legend()):
+        labels = [text.get_text() for text in legend.get_texts()]
+        assert labels == ["a (AUC 50.0 %)", "b (AUC 0.0 %)"]

@@ -25,9 +25,11 @@ from dopepp.metrics.functional import (
 )
 
 REL = 1e-9
+NAN = math.nan
+ONES, TRUE = torch.ones(2), torch.tensor([True, True])
 
 
-def voc_loop(errors: list[float], maximum: float) -> float:
+def voc_loop(errors, maximum):
     """YCB-Video's rule, written from its description: right-sided rectangles over sorted errors."""
     total, previous, result = 0.0, 0.0, 0
     for error in sorted(e for e in errors if e <= maximum):
@@ -57,11 +59,24 @@ def test_auc_equals_loops(errors):
         assert voc - exact == pytest.approx(max(hits) / (len(errors) * 0.1), rel=1e-6, abs=1e-12)
 
 
-def test_auc_refuses_other_methods_and_empty_ranges():
-    with pytest.raises(UserError, match="got auc method 'coco'; allowed: exact, voc"):
-        auc(torch.zeros(1), 0.1, "coco")
-    with pytest.raises(UserError, match="got max_threshold=0"):
-        auc(torch.zeros(1), 0)
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: auc(ONES, 0.1, "coco"), UserError, "got auc method 'coco'; allowed: exact, voc"),
+        (lambda: auc(ONES, 0), UserError, "got max_threshold=0"),
+        (lambda: average_recall(ONES, []), UserError, "no thresholds"),
+        (lambda: match(ONES, torch.zeros(3, 1), 0.1), ValueError, "2 scores need as many rows"),
+        (lambda: average_precision(ONES, TRUE, 1), ValueError, "2 correct predictions of 1"),
+        (lambda: average_precision(ONES, TRUE[:1], 1), ValueError, "differ"),
+        (lambda: expected_calibration_error(1.5 * ONES, TRUE), ValueError, r"\[0, 1\]"),
+        (lambda: expected_calibration_error(ONES * NAN, TRUE), ValueError, r"\[0, 1\]"),
+        (lambda: expected_calibration_error(ONES, TRUE[:1]), ValueError, "bins"),
+    ],
+    ids=["method", "range", "thresholds", "rows", "too many", "lengths", "above 1", "NaN", "bins"],
+)
+def test_wrong_arguments_are_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
 
 
 def test_pass_rate_is_strict_and_misses_count():
@@ -70,20 +85,20 @@ def test_pass_rate_is_strict_and_misses_count():
     assert (pass_rate(torch.empty(0), 0.1), pass_rate(errors[3:], 0.1)) == (0.0, 0.0)
 
 
-def test_match_breaks_ties_by_order_and_includes_the_limit():
-    limit = torch.full((2, 2), 0.1, dtype=torch.float64)
-    assert match(torch.ones(2), limit, 0.1).tolist() == [0, 1]
-    assert match(torch.ones(1), torch.tensor([[0.1000001]]), 0.1).tolist() == [-1]
-    assert match(torch.ones(1), torch.tensor([[0.02, 0.02]]), 0.1).tolist() == [0]
-
-
-def test_match_of_nothing_and_of_nan():
-    assert match(torch.empty(0), torch.empty(0, 3), 0.1).tolist() == []
-    assert match(torch.ones(2), torch.empty(2, 0), 0.1).tolist() == [-1, -1]
-    nan = torch.tensor([[math.nan, 0.02], [0.01, math.nan]])
-    assert match(torch.tensor([math.nan, 0.1]), nan, 0.1).tolist() == [1, 0]
-    with pytest.raises(ValueError, match="2 scores need as many rows"):
-        match(torch.ones(2), torch.zeros(3, 1), 0.1)
+@pytest.mark.parametrize(
+    ("scores", "distances", "expected"),
+    [
+        pytest.param([1, 1], [[0.1, 0.1]] * 2, [0, 1], id="ties go by order, at the limit"),
+        pytest.param([1], [[0.1000001]], [-1], id="beyond the limit"),
+        pytest.param([1], [[0.02, 0.02]], [0], id="one of two"),
+        pytest.param([NAN, 0.1], [[NAN, 0.02], [0.01, NAN]], [1, 0], id="unknown"),
+        pytest.param([], np.zeros((0, 3)), [], id="no detections"),
+        pytest.param([1, 1], np.zeros((2, 0)), [-1, -1], id="no instances"),
+    ],
+)
+def test_match_of_special_cases(scores, distances, expected):
+    distances = torch.tensor(distances, dtype=torch.float64)
+    assert match(torch.tensor(scores), distances, 0.1).tolist() == expected
 
 
 @given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
@@ -119,16 +134,10 @@ def test_average_precision_is_its_definition(seed, count):
 
 
 def test_average_precision_at_the_ends():
-    none = torch.zeros(0)
-    assert average_precision(none, none.bool(), 3) == 0.0
-    assert average_precision(torch.ones(2), torch.zeros(2, dtype=torch.bool), 0) == 0.0
-    assert average_precision(torch.ones(2), torch.ones(2, dtype=torch.bool), 2) == 1.0
-    unknown = torch.tensor([torch.nan, 0.1])
-    assert average_precision(unknown, torch.tensor([False, True]), 1) == 1.0
-    with pytest.raises(ValueError, match="3 correct predictions of 2"):
-        average_precision(torch.ones(3), torch.ones(3, dtype=torch.bool), 2)
-    with pytest.raises(ValueError, match="differ"):
-        average_precision(torch.ones(3), torch.ones(2, dtype=torch.bool), 2)
+    assert average_precision(ONES[:0], TRUE[:0], 3) == 0.0
+    assert average_precision(ONES, ~TRUE, 0) == 0.0
+    assert average_precision(ONES, TRUE, 2) == 1.0
+    assert average_precision(torch.tensor([NAN, 0.1]), torch.tensor([False, True]), 1) == 1.0
 
 
 def test_average_recall_is_the_mean_of_strict_pass_rates():
@@ -138,8 +147,6 @@ def test_average_recall_is_the_mean_of_strict_pass_rates():
     assert average_recall(errors, BOP_THRESHOLDS) == pytest.approx(sum(rates) / 10)
     assert average_recall(torch.zeros(0), BOP_MSPD_THRESHOLDS) == 0.0
     assert (len(BOP_THRESHOLDS), BOP_THRESHOLDS[2], BOP_MSPD_THRESHOLDS[-1]) == (10, 0.15, 50.0)
-    with pytest.raises(UserError, match="no thresholds"):
-        average_recall(errors, [])
 
 
 @settings(max_examples=100)
@@ -174,16 +181,10 @@ def test_calibration_error_is_its_definition(seed, count, bins):
     assert result == pytest.approx(expected, abs=1e-12)
 
 
-def test_calibration_error_of_extreme_and_invalid_scores():
-    none = torch.zeros(0)
-    assert expected_calibration_error(none, none.bool()) == 0.0
-    assert expected_calibration_error(torch.ones(3), torch.ones(3, dtype=torch.bool)) == 0.0
-    assert expected_calibration_error(torch.ones(3), torch.zeros(3, dtype=torch.bool)) == 1.0
-    for scores in (torch.tensor([1.5]), torch.tensor([torch.nan])):
-        with pytest.raises(ValueError, match=r"\[0, 1\]"):
-            expected_calibration_error(scores, torch.ones(1, dtype=torch.bool))
-    with pytest.raises(ValueError, match="bins"):
-        expected_calibration_error(torch.ones(2), torch.ones(1, dtype=torch.bool))
+def test_calibration_error_of_extreme_scores():
+    assert expected_calibration_error(ONES[:0], TRUE[:0]) == 0.0
+    assert expected_calibration_error(ONES, TRUE) == 0.0
+    assert expected_calibration_error(ONES, ~TRUE) == 1.0
 
 
 @settings(max_examples=60)

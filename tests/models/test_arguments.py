@@ -11,6 +11,7 @@ from dopepp.models.layers import find_activation
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import BACKBONES, HEADS, LOSSES
 
+MAPS = {"in_channels": 8, "num_objects": 1}
 WITH_WEIGHTS = {"weights_path": "vgg19.pth"}
 FULL_WIDTH = "with width=1 and batch_norm=false"
 
@@ -68,13 +69,9 @@ FULL_WIDTH = "with width=1 and batch_norm=false"
 )
 def test_arguments_are_bounded(kind, arguments, message):
     provided = {SE: {"channels": 8}, CBAM: {"channels": 8}}
-    provided |= {head: {"in_channels": 8, "num_objects": 1} for head in (Cascade, MultiScale)}
-    provided[SharedTrunk] = provided[Cascade]
+    provided |= dict.fromkeys((Cascade, MultiScale, SharedTrunk), MAPS)
     with pytest.raises(UserError, match=message):
-        kind(**{**provided.get(kind, {}), **arguments})
-
-
-MAPS = {"in_channels": 8, "num_objects": 1}
+        kind(**provided.get(kind, {}) | arguments)
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,11 @@ from scipy.signal import correlate2d
 from dopepp.models.attention import CBAM, SE, Identity
 
 
-def sigmoid(values: np.ndarray) -> np.ndarray:
+def sigmoid(values):
     return 1 / (1 + np.exp(-values))
 
 
-def weights_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
+def weights_of(module):
     return {name: value.detach().numpy() for name, value in module.named_parameters()}
 
 
@@ -21,17 +21,14 @@ def test_cbam_is_equations_5_and_6(kernel_size):
     features = torch.randn(2, 8, 5, 6, dtype=torch.float64)
     weights = weights_of(module)
 
-    def mlp(vector: np.ndarray) -> np.ndarray:
+    def mlp(vector):
         return weights["mlp.2.weight"] @ np.maximum(weights["mlp.0.weight"] @ vector, 0)
 
     for image, result in zip(features.numpy(), module(features).detach().numpy(), strict=True):
         channel = sigmoid(mlp(image.mean((1, 2))) + mlp(image.max((1, 2))))
         scaled = image * channel[:, None, None]
-        planes = (scaled.mean(0), scaled.max(0))
-        spatial = sum(
-            correlate2d(plane, kernel, mode="same")
-            for plane, kernel in zip(planes, weights["spatial.weight"][0], strict=True)
-        )
+        planes = zip((scaled.mean(0), scaled.max(0)), weights["spatial.weight"][0], strict=True)
+        spatial = sum(correlate2d(plane, kernel, mode="same") for plane, kernel in planes)
         np.testing.assert_allclose(result, scaled * sigmoid(spatial), rtol=1e-10)
 
 

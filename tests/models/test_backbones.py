@@ -7,23 +7,25 @@ from dopepp.models.backbones import DSC, VGG19, Pyramid, VGG19Original
 from dopepp.models.efficientnet import EfficientNetLite
 
 
-def num_weights(module: nn.Module) -> int:
-    return sum(layer.weight.numel() for layer in module.modules() if isinstance(layer, nn.Conv2d))
+def convolutions(module):
+    return [layer for layer in module.modules() if isinstance(layer, nn.Conv2d)]
+
+
+def num_weights(module):
+    return sum(layer.weight.numel() for layer in convolutions(module))
 
 
 def test_paper_counts_without_biases():
     assert num_weights(DSC()) == 1_107_776
-    normed = DSC(batch_norm=True).modules()
-    assert all(item.bias is None for item in normed if isinstance(item, nn.Conv2d))
+    assert all(layer.bias is None for layer in convolutions(DSC(batch_norm=True)))
     assert num_weights(VGG19Original()) == 9_696_960
 
 
 def test_dsc_is_depthwise_then_pointwise_with_relu_after_each():
     layers = [layer for layer in DSC().modules() if isinstance(layer, (nn.Conv2d, nn.ReLU))]
-    convolutions = layers[::2]
     assert all(isinstance(layer, nn.ReLU) for layer in layers[1::2])
-    assert len(convolutions) == 1 + 2 * 12
-    for depthwise, pointwise in zip(convolutions[1::2], convolutions[2::2], strict=True):
+    assert len(layers[::2]) == 1 + 2 * 12
+    for depthwise, pointwise in zip(layers[2::4], layers[4::4], strict=True):
         assert depthwise.groups == depthwise.in_channels == depthwise.out_channels
         assert depthwise.kernel_size == (3, 3)
         assert (pointwise.kernel_size, pointwise.groups) == ((1, 1), 1)
@@ -42,16 +44,14 @@ def test_publishes_its_channels_and_stride(backbone, width, channels, batch_norm
 def test_a_pyramid_has_the_weights_of_its_blocks():
     """Count the weights of blocks, and of shortcuts where the shape changes."""
 
-    def block(before: int, after: int) -> int:
+    def block(before, after):
         return 9 * before * after + 9 * after * after + (before * after if before != after else 0)
 
     down = (block(8, 8), block(8, 16) + block(16, 16), block(16, 24), block(24, 40))
     up = (40 * 24 + block(24, 24) * 2, 24 * 16)
     backbone = Pyramid((8, 16, 24, 40), (1, 2, 1, 1), (2, 0))
     assert num_weights(backbone) == 9 * 48 * 8 + sum(down) + sum(up)
-    assert all(
-        module.bias is None for module in backbone.modules() if isinstance(module, nn.Conv2d)
-    )
+    assert all(layer.bias is None for layer in convolutions(backbone))
 
 
 @pytest.mark.parametrize("backbone", [Pyramid, EfficientNetLite])

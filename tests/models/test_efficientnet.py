@@ -9,6 +9,7 @@ from dopepp.core.errors import UserError
 from dopepp.models.efficientnet import DepthwiseConv, EfficientNetLite
 from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD
 from dopepp.models.network import architecture, build_network
+from tests.models.conftest import weights_of
 
 ENDS = (4, 10, 15)
 """The published network's last blocks at strides 8, 16 and 32."""
@@ -64,18 +65,16 @@ def test_pretrained_features_distinguish_a_cat_from_a_cup(published, pretrained)
 def test_only_layers_that_are_not_frozen_learn(frozen, count):
     torch.manual_seed(0)
     backbone = EfficientNetLite(width=0.125, frozen=frozen).train()
-    before = {name: value.clone() for name, value in backbone.state_dict().items()}
-    optimizer = torch.optim.SGD(
-        [parameter for parameter in backbone.parameters() if parameter.requires_grad], 0.1
-    )
+    before = weights_of(backbone)
+    learned = [parameter for parameter in backbone.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.SGD(learned, 0.1)
     backbone(torch.randn(2, 3, 64, 64)).square().mean().backward()
     optimizer.step()
     kept = {f"down.{number}" for number in range(count)}
     for name, value in backbone.state_dict().items():
-        if name.endswith("num_batches_tracked"):
-            continue
-        same = torch.equal(value, before[name])
-        assert same == (".".join(name.split(".")[:2]) in kept), name
+        if not name.endswith("num_batches_tracked"):
+            same = torch.equal(value, before[name])
+            assert same == (".".join(name.split(".")[:2]) in kept), name
 
 
 def test_learned_depthwise_convolutions_stay_in_float32_on_the_cpu():

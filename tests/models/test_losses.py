@@ -13,13 +13,13 @@ SIGMA = 1.5
 NOTHING = -60.0
 
 
-def gaussian(x: float, y: float, size: int = 16) -> torch.Tensor:
-    grid = torch.arange(size, dtype=torch.float32)
+def gaussian(x, y):
+    grid = torch.arange(16, dtype=torch.float32)
     squared = (grid[None, :] - x) ** 2 + (grid[:, None] - y) ** 2
     return torch.exp(-squared / (2 * SIGMA**2))
 
 
-def targets(num_objects: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+def targets(num_objects=1):
     belief = torch.stack([gaussian(3 + c % 9, 12 - c % 9) for c in range(9 * num_objects)])[None]
     field = torch.zeros(1, 16 * num_objects, 16, 16)
     field[:, 0::2, 4:7, 4:7] = 0.6
@@ -111,9 +111,8 @@ def test_field_error_counts_only_inside_the_discs():
     belief, target = targets()
     inside = (target != 0).float()
     logits = belief.clamp(min=math.exp(NOTHING)).log()
-    _, parts = SpatialCrossEntropy(SIGMA, field_weight=3.0)(
-        [(logits, target + 0.2)], belief, target
-    )
+    loss = SpatialCrossEntropy(SIGMA, field_weight=3.0)
+    _, parts = loss([(logits, target + 0.2)], belief, target)
     # Smooth L1 of 0.2 is 0.02, twice per vector; the cells outside are off by 0.2 as well.
     assert float(parts["field"]) == pytest.approx(3.0 * 0.04, rel=1e-4)
     _, parts = SpatialCrossEntropy(SIGMA)([(logits, target + 10 * (1 - inside))], belief, target)
@@ -143,8 +142,7 @@ def test_losses_of_the_images_have_the_loss_as_their_mean(loss):
     stages = [(torch.randn(4, 9, 8, 8, generator=generator), 0.1 * field) for _ in range(2)]
     stages[0][0].requires_grad_()
     images = loss.per_image(stages, belief, field)
-    assert images.shape == (4,)
-    assert not images.requires_grad
+    assert (images.shape, images.requires_grad) == ((4,), False)
     assert images.mean().item() == pytest.approx(loss(stages, belief, field)[0].item(), rel=1e-5)
 
 
@@ -152,6 +150,5 @@ def test_the_loss_of_an_image_depends_on_this_image_only():
     belief, field = torch.rand(3, 9, 8, 8), torch.ones(3, 16, 8, 8)
     wrong = belief.clone()
     wrong[1] += 0.5
-    assert MapMSE().per_image([(wrong, field)], belief, field).tolist() == pytest.approx(
-        [0, 0.25, 0]
-    )
+    losses = MapMSE().per_image([(wrong, field)], belief, field)
+    assert losses.tolist() == pytest.approx([0, 0.25, 0])

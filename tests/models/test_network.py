@@ -1,5 +1,4 @@
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -9,9 +8,10 @@ from dopepp.core.errors import UserError
 from dopepp.models.heads import Cascade, MultiScale, SharedTrunk
 from dopepp.models.layers import find_activation, scaled_channels
 from dopepp.models.network import build_network, network_cost
+from tests.models.conftest import assert_weights, weights_of
 
 
-def num_parameters(module: nn.Module) -> int:
+def num_parameters(module):
     return sum(parameter.numel() for parameter in module.parameters())
 
 
@@ -30,24 +30,17 @@ def test_every_combination_gives_stages_of_the_right_shape(
     images = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
     stages = network(images)
     assert len(stages) == num_stages
-    for belief, field in stages:
-        assert belief.shape == (2, 9 * num_objects, 4, 8)
-        assert field.shape == (2, 16 * num_objects, 4, 8)
-        assert torch.isfinite(belief).all()
-        assert torch.isfinite(field).all()
-    for image, same in zip(stages[0], network(images.float())[0], strict=True):
-        assert torch.equal(image, same)
+    for maps in stages:
+        assert [part.shape for part in maps] == [(2, n * num_objects, 4, 8) for n in (9, 16)]
+        assert all(part.isfinite().all() for part in maps)
+    torch.testing.assert_close(stages[0], network(images.float())[0], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
     ("backbone", "head"),
-    [
-        ("Pyramid", "SharedTrunk"),
-        ("EfficientNetLite", "SharedTrunk"),
-        ("DSC", "MultiScale"),
-        ("VGG19", "Cascade"),
-    ],
-)
+    [("Pyramid", "SharedTrunk"), ("EfficientNetLite", "SharedTrunk"), ("DSC", "MultiScale"),
+     ("VGG19", "Cascade")],
+)  # fmt: skip
 def test_the_copy_for_inference_gives_the_same_maps_without_batch_norm(make_spec, backbone, head):
     options = {"backbone_width": 0.125, "head_width": 0.125}
     options |= {} if head == "SharedTrunk" else {"head_batch_norm": True}
@@ -57,14 +50,13 @@ def test_the_copy_for_inference_gives_the_same_maps_without_batch_norm(make_spec
         for values, least in ((norm.running_var, 0.2), (norm.weight, 0.5), (norm.bias, -0.5)):
             nn.init.uniform_(values, least, least + 1)
         nn.init.normal_(norm.running_mean)
-    before = {name: value.clone() for name, value in network.state_dict().items()}
+    before = weights_of(network)
     folded = network.for_inference()
     assert network.training
-    assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
+    assert_weights(network, before)
     assert not any(isinstance(layer, nn.BatchNorm2d) for layer in folded.modules())
     with torch.inference_mode():
-        for same, expected in zip(folded(images)[-1], network.eval()(images)[-1], strict=True):
-            torch.testing.assert_close(same, expected)
+        torch.testing.assert_close(folded(images)[-1], network.eval()(images)[-1])
 
 
 @pytest.mark.parametrize("stages", [1, 2])
@@ -92,12 +84,16 @@ def test_every_scale_of_a_multi_scale_stage_has_its_own_maps(make_spec, stages):
 
 
 def test_maps_of_nine_channels_cost_less_than_features(make_spec):
-    counts = {
-        maps: num_parameters(build_network(make_spec(head_batch_norm=True, head_maps=maps)))
-        for maps in (None, "plain", "learned")
-    }
-    assert counts["plain"] == counts["learned"] == 5_152_694
-    assert counts[None] == 6_573_419
+    for maps, count in ((None, 6_573_419), ("plain", 5_152_694), ("learned", 5_152_694)):
+        network = build_network(make_spec(head_batch_norm=True, head_maps=maps))
+        assert num_parameters(network) == count
+
+
+def test_the_fast_network_has_the_weights_that_are_documented(make_spec):
+    """conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width."""
+    widths = {"backbone_width": 0.5, "head_width": 0.5}
+    network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **widths))
+    assert num_parameters(network) == 2_645_305
 
 
 def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
@@ -149,20 +145,17 @@ def test_sizes_are_multiples_of_the_backbones_and_the_heads(make_spec, head):
 
 def test_activations():
     logits = torch.tensor([-30.0, math.log(0.25), 0.0, 3.0])
-    torch.testing.assert_close(
-        find_activation("exp")(logits), torch.tensor([math.exp(-30), 0.25, 1.0, 1.0])
-    )
+    expected = torch.tensor([math.exp(-30), 0.25, 1.0, 1.0])
+    torch.testing.assert_close(find_activation("exp")(logits), expected)
     assert torch.equal(find_activation("identity")(logits), logits)
     assert find_activation("exp")(logits.bfloat16()).dtype == torch.float32
 
 
 @pytest.mark.parametrize(("activation", "expected"), [("identity", 0.0), ("exp", 0.01)])
-@pytest.mark.parametrize(
-    "head", [partial(Cascade, stages=2), partial(MultiScale, stages=2), SharedTrunk]
-)
-def test_an_untrained_head_gives_nearly_empty_maps(head, activation, expected):
+@pytest.mark.parametrize("kind", [Cascade, MultiScale, SharedTrunk])
+def test_an_untrained_head_gives_nearly_empty_maps(kind, activation, expected):
     torch.manual_seed(0)
-    head = head(128, 1, activation)
+    head = kind(128, 1, activation, **{} if kind is SharedTrunk else {"stages": 2})
     with torch.no_grad():
         stages = head(torch.randn(2, 128, 16, 16).relu())
     for belief, field in stages:
@@ -216,13 +209,6 @@ def test_scaled_channels(channels, width, expected):
     assert scaled_channels(channels, width) == expected
 
 
-def test_the_fast_network_has_the_weights_that_are_documented(make_spec):
-    """conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width."""
-    widths = {"backbone_width": 0.5, "head_width": 0.5}
-    network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **widths))
-    assert num_parameters(network) == 2_645_305
-
-
 @pytest.mark.parametrize("half", [False, True])
 def test_a_gradient_reaches_every_parameter_of_the_fast_network(small_fast_spec, half):
     torch.manual_seed(0)
@@ -249,20 +235,17 @@ def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
     assert 0.05 < features[0].std() < 20
 
 
-def macs_by_hooks(network: nn.Module, images: torch.Tensor) -> int:
+def macs_by_hooks(network, images):
     """Count while running: an output value takes one product per weight of its filter."""
-    total = 0
-
-    def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
-        nonlocal total
-        total += output.numel() * layer.weight[0].numel()
-
+    products = []
     for layer in network.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)):
-            layer.register_forward_hook(count)
+            layer.register_forward_hook(
+                lambda layer, _, out: products.append(out.numel() * layer.weight[0].numel())
+            )
     with torch.no_grad():
         network(images)
-    return total
+    return sum(products)
 
 
 @pytest.mark.parametrize("attention", ["Identity", "SE", "CBAM"])
@@ -291,10 +274,8 @@ def test_most_of_dopes_compute_is_in_its_stages(make_spec):
 def test_measuring_the_cost_does_not_change_the_network(small_spec):
     network = build_network(small_spec).train()
     network.attention.eval()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
+    before = weights_of(network)
     network_cost(network, (32, 32))
-    assert network.training
-    assert not network.attention.training
+    assert (network.training, network.attention.training) == (True, False)
+    assert_weights(network, before)
     assert all(parameter.device.type == "cpu" for parameter in network.parameters())
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, before[name])

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -11,8 +9,10 @@ from dopepp.models.network import build_network
 from dopepp.models.start import start_from_checkpoint, start_from_parts
 from dopepp.models.storage import read_safetensors
 from dopepp.parts.part import Mesh, make_part
+from tests.models.conftest import assert_weights, weights_of
 
-OUTPUTS = "head.{kind}_branches.0.1.{tensor}"
+OUTPUTS = {f"head.{k}_branches.0.1.{t}" for k in ("belief", "field") for t in ("weight", "bias")}
+FAST = {"backbone_width": 0.5, "head_width": 0.5}
 
 
 @pytest.fixture
@@ -31,24 +31,16 @@ def write(tmp_path):
     return write
 
 
-def output_names():
-    kinds = ("belief", "field")
-    return {OUTPUTS.format(kind=k, tensor=t) for k in kinds for t in ("weight", "bias")}
-
-
-FAST = {"backbone_width": 0.5, "head_width": 0.5}
-
-
 @pytest.mark.parametrize("num_objects", [1, 3])
 @pytest.mark.parametrize("attention", ["Identity", "SE"])
 def test_the_weights_of_random_parts_fill_backbone_and_trunk(make_spec, num_objects, attention):
     spec = make_spec("Pyramid", attention, "SharedTrunk", num_objects=num_objects, **FAST)
     network = build_network(spec)
-    before = {name: value.clone() for name, value in network.state_dict().items()}
+    before = weights_of(network)
     assert start_from_parts(network)
     weights, _ = read_safetensors(start._FILE)
     for name, value in network.state_dict().items():
-        kept = name in output_names() or name.startswith("attention.")
+        kept = name in OUTPUTS or name.startswith("attention.")
         assert kept == (name not in weights)
         expected = before[name] if kept else weights[name].to(value.dtype)
         assert torch.equal(value, expected), name
@@ -58,10 +50,9 @@ def test_the_weights_of_random_parts_fill_backbone_and_trunk(make_spec, num_obje
 @pytest.mark.parametrize("changed", [{"backbone_width": 1.0}, {"head_width": 0.25}])
 def test_a_network_of_another_shape_keeps_its_weights(make_spec, changed):
     network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **{**FAST, **changed}))
-    before = {name: value.clone() for name, value in network.state_dict().items()}
+    before = weights_of(network)
     assert not start_from_parts(network)
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, before[name]), name
+    assert_weights(network, before)
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(small_spec, write):
@@ -71,19 +62,12 @@ def test_a_checkpoint_of_another_architecture_is_refused(small_spec, write):
         start_from_checkpoint(build_network(other), path)
 
 
-def test_a_checkpoint_of_as_many_objects_fills_everything(small_fast_spec, write):
-    weights, path = write(small_fast_spec)
+@pytest.mark.parametrize(("num_objects", "kept"), [(1, set()), (2, OUTPUTS)])
+def test_a_checkpoint_of_other_objects_leaves_the_output_layers(
+    small_fast_spec, write, num_objects, kept
+):
+    weights, path = write({**small_fast_spec, "num_objects": num_objects})
     network = build_network(small_fast_spec)
+    before = weights_of(network)
     start_from_checkpoint(network, path)
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, weights[name]), name
-
-
-def test_a_checkpoint_of_other_objects_leaves_the_output_layers(small_fast_spec, write):
-    weights, path = write({**small_fast_spec, "num_objects": 2})
-    network = build_network(small_fast_spec)
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    start_from_checkpoint(network, path)
-    for name, value in network.state_dict().items():
-        expected = before if name in output_names() else weights
-        assert torch.equal(value, expected[name]), name
+    assert_weights(network, weights | {name: before[name] for name in kept})

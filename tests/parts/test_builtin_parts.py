@@ -3,21 +3,17 @@ import sys
 
 import numpy as np
 import pytest
-import trimesh
 from manifold3d import Error, Manifold, Mesh64
 from scipy.spatial.transform import Rotation
 
-from dopepp.parts import Part, pivconnector, servoholder
+from dopepp.parts import pivconnector, servoholder
+from tests.parts.makers import solid_of
 
 SIZES = {servoholder: (0.077, 0.077, 0.007), pivconnector: (0.105, 0.052, 0.007)}
 PARTS = pytest.mark.parametrize("build", SIZES, ids=lambda build: build.__name__)
 
 
-def to_trimesh(part: Part) -> trimesh.Trimesh:
-    return trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False)
-
-
-def to_solid(part: Part, centre: np.ndarray) -> Manifold:
+def to_solid(part, centre):
     """Millimetres about ``centre`` (metres)."""
     vertices = np.ascontiguousarray(1000 * (part.mesh.vertices - centre))
     solid = Manifold(Mesh64(vertices, part.mesh.faces.astype(np.uint64)))
@@ -25,7 +21,7 @@ def to_solid(part: Part, centre: np.ndarray) -> Manifold:
     return solid
 
 
-def share_moved(solid: Manifold, rotation: np.ndarray) -> float:
+def share_moved(solid, rotation):
     """Volume of the symmetric difference with the rotated solid, over the solid's own."""
     rotated = solid.transform(np.column_stack([rotation, np.zeros(3)]))
     return float(2 * (1 - (solid ^ rotated).volume() / solid.volume()))
@@ -33,19 +29,18 @@ def share_moved(solid: Manifold, rotation: np.ndarray) -> float:
 
 @PARTS
 def test_has_the_papers_size_about_the_origin(build):
-    part = build()
-    half = np.array(SIZES[build]) / 2
+    part, half = build(), np.array(SIZES[build]) / 2
     assert part.name == build.__name__
-    np.testing.assert_allclose(part.mesh.vertices.max(axis=0), half, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(part.mesh.vertices.min(axis=0), -half, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(part.cuboid[0], half * [1, -1, 1], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(part.cuboid[8], 0, rtol=0, atol=1e-15)
+    ends = part.mesh.vertices.max(axis=0), part.mesh.vertices.min(axis=0)
+    np.testing.assert_allclose(ends, [half, -half], rtol=0, atol=1e-15)
+    expected = [half * [1, -1, 1], [0, 0, 0]]
+    np.testing.assert_allclose(part.cuboid[[0, 8]], expected, rtol=0, atol=1e-15)
     assert np.linalg.norm(half) * 1.8 < part.diameter <= np.linalg.norm(2 * half)
 
 
 @PARTS
 def test_is_one_printable_solid(build):
-    mesh = to_trimesh(build())
+    mesh = solid_of(build().mesh)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert mesh.body_count == 1
@@ -62,7 +57,7 @@ def test_no_rotation_maps_it_onto_itself(build, about):
     # differ, which leaves rotations about z and flips about axes in the plane.
     part = build()
     assert part is build()  # made once
-    centre = part.cuboid[8] if about == "bounding box" else to_trimesh(part).center_mass
+    centre = part.cuboid[8] if about == "bounding box" else solid_of(part.mesh).center_mass
     solid = to_solid(part, centre)
     group = Rotation.create_group("O").as_matrix()
     shares = [share_moved(solid, R) for R in group if np.trace(R) < 2.9]

@@ -5,10 +5,9 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import pivconnector, servoholder, with_meshes
-from dopepp.parts.part import Part
 
 
-def without_mesh(name: str, mesh_hash: str = "") -> Part:
+def without_mesh(name, mesh_hash=""):
     return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
 
 

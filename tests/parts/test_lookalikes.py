@@ -10,14 +10,10 @@ from dopepp.parts.lookalikes import STRETCH, lookalikes, mirror_distance
 from dopepp.parts.mesh import weld
 from dopepp.parts.mesh.read import find_topology
 from dopepp.parts.part import Mesh, make_part
+from tests.parts.makers import mesh_of, solid_of
 
 
-def mesh_of(*boxes: trimesh.Trimesh) -> Mesh:
-    body = trimesh.util.concatenate(boxes)
-    return Mesh(np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int32))
-
-
-def box(size, at=(0, 0, 0)) -> trimesh.Trimesh:
+def box(size, at=(0, 0, 0)):
     body = trimesh.creation.box(size)
     body.apply_translation(at)
     return body
@@ -50,21 +46,16 @@ def test_symmetric_bodies_are_their_own_mirror_images_in_any_pose(body):
 def test_a_body_that_only_a_point_reflects_is_its_own_mirror_image():
     # A parallelepiped of unequal edges and angles has no mirror plane.
     edges = np.array([[0.1, 0.0, 0.0], [0.03, 0.07, 0.0], [0.02, 0.03, 0.05]])
-    cube = box((1, 1, 1))
-    assert mirror_distance(Mesh(cube.vertices @ edges, np.asarray(cube.faces, np.int32))) < 0.01
+    cube = mesh_of(box((1, 1, 1)))
+    assert mirror_distance(Mesh(cube.vertices @ edges, cube.faces)) < 0.01
 
 
 def test_a_chiral_part_has_a_mirrored_copy():
     assert mirror_distance(CHIRAL) > 0.02
     part = make_part("arms", CHIRAL)
-    mirrored, stretched, cut = lookalikes([part])
-    assert [each.name for each in (mirrored, stretched, cut)] == [
-        "arms, mirrored", "arms, stretched", "arms, cut",
-    ]  # fmt: skip
-    volumes = []
-    for each in (part, mirrored, stretched, cut):
-        assert each.mesh is not None
-        volumes.append(trimesh.Trimesh(each.mesh.vertices, each.mesh.faces, process=False).volume)
+    mirrored, stretched, cut = copies = lookalikes([part])
+    assert [copy.name for copy in copies] == ["arms, mirrored", "arms, stretched", "arms, cut"]
+    volumes = [solid_of(each.mesh).volume for each in (part, mirrored, stretched, cut)]
     # A mirrored surface is not turned inside out; a stretched one grows along one side.
     assert volumes[1] == pytest.approx(volumes[0])
     assert volumes[2] == pytest.approx(STRETCH * volumes[0])
@@ -77,12 +68,9 @@ def test_a_chiral_part_has_a_mirrored_copy():
 
 def test_a_cut_copy_stays_closed_and_keeps_its_colours():
     part = pivconnector()
-    assert part.mesh is not None
     colours = np.tile(np.array([[200, 30, 30]], np.uint8), (len(part.mesh.vertices), 1))
     coloured = Mesh(part.mesh.vertices, part.mesh.faces, colours=colours)
     cut = lookalikes([make_part("coloured", coloured)])[-1]
-    assert cut.mesh is not None
-    assert cut.mesh.colours is not None
     np.testing.assert_array_equal(cut.mesh.colours, colours)
     assert find_topology(weld(cut.mesh.vertices, cut.mesh.faces)[1]).is_closed
     moved = np.linalg.norm(cut.mesh.vertices - part.mesh.vertices, axis=1)

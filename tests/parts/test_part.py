@@ -7,11 +7,11 @@ import trimesh
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts import Mesh, make_part, servoholder
+from tests.parts.makers import mesh_of
 
 
-def box(size: tuple[float, float, float]) -> Mesh:
-    mesh = trimesh.creation.box(size)
-    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+def box(size):
+    return mesh_of(trimesh.creation.box(size))
 
 
 def test_measures_a_box():
@@ -20,8 +20,7 @@ def test_measures_a_box():
     half = np.array([0.015, 0.02, 0.06])
     np.testing.assert_allclose(part.cuboid, cuboid_keypoints(-half, half), atol=1e-18)
     assert part.points.shape == (2000, 3)
-    assert part.symmetries_discrete is None
-    assert part.symmetries_continuous == ()
+    assert (part.symmetries_discrete, part.symmetries_continuous) == (None, ())
 
 
 def test_points_alone_make_a_part_without_mesh():
@@ -30,8 +29,7 @@ def test_points_alone_make_a_part_without_mesh():
     with pytest.raises(ValueError, match="a mesh or points"):
         make_part("nothing", None)
     part = make_part("cloud", None, points)
-    assert part.mesh is None
-    assert part.mesh_hash == ""
+    assert (part.mesh, part.mesh_hash) == (None, "")
     assert part.diameter == pytest.approx(np.linalg.norm([0.03, 0.04, 0.1]))
     np.testing.assert_allclose(part.cuboid[8], [0.015, 0.02, 0.05])
 
@@ -41,8 +39,7 @@ def test_different_meshes_have_different_hashes():
     moved = Mesh(np.nextafter(mesh.vertices, 1), mesh.faces)
     turned = Mesh(mesh.vertices, mesh.faces[:, [1, 2, 0]])
     hashes = {make_part("box", m).mesh_hash for m in (mesh, moved, turned)}
-    assert len(hashes) == 3
-    assert all(len(h) == 64 for h in hashes)
+    assert list(map(len, hashes)) == [64] * 3
     assert make_part("other", box((0.1, 0.1, 0.1))).mesh_hash in hashes
 
 
@@ -77,13 +74,7 @@ def test_shapes_are_compared_independently_of_their_triangles():
     solid = trimesh.creation.box((0.1, 0.06, 0.02))
     thinner = trimesh.creation.box((0.1, 0.06, 0.019))
     solids = (solid, solid.subdivide(), solid.copy().apply_scale(1.005), thinner)
-    part, finer, other, thin = (
-        make_part("box", Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32)))
-        for mesh in solids
-    )
+    part, finer, other, thin = (make_part("box", mesh_of(solid)) for solid in solids)
     assert part.mesh_hash != finer.mesh_hash
-    assert part.has_shape_of(finer)
-    assert not part.has_shape_of(other)
-    assert not part.has_shape_of(thin)
-    assert part.has_shape_of(replace(part, mesh=None))
-    assert not part.has_shape_of(replace(other, mesh=None))
+    others = (finer, replace(part, mesh=None), other, thin, replace(other, mesh=None))
+    assert [part.has_shape_of(each) for each in others] == [True, True, False, False, False]

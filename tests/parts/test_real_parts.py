@@ -7,14 +7,11 @@ from scipy.spatial.distance import pdist
 
 from dopepp.core.errors import UserError
 from dopepp.parts import load_part, ycb_part
+from tests.parts.makers import solid_of
 
-TEXTURED = (
-    "003_cracker_box",
-    "005_tomato_soup_can",
-    "006_mustard_bottle",
-    "009_gelatin_box",
-    "010_potted_meat_can",
-)
+TEXTURED = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box",
+            "010_potted_meat_can")  # fmt: skip
+GELATIN = "009_gelatin_box"
 
 
 def test_stl_parts_agree_with_trimesh(shared_data):
@@ -24,10 +21,9 @@ def test_stl_parts_agree_with_trimesh(shared_data):
         part = load_part(path)
         reference = trimesh.load_mesh(path)
         assert 0.05 < part.diameter < 0.1
-        assert part.diameter == pytest.approx(
-            pdist(np.asarray(reference.convex_hull.vertices) / 1000).max()
-        )
-        solid = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False)
+        hull = np.asarray(reference.convex_hull.vertices) / 1000
+        assert part.diameter == pytest.approx(pdist(hull).max())
+        solid = solid_of(part.mesh)
         assert solid.is_watertight == reference.is_watertight
         assert solid.volume == pytest.approx(reference.volume / 1e9)
         assert part.points.shape == (2000, 3)
@@ -48,7 +44,7 @@ def test_a_textured_model_agrees_with_trimesh(ycb_root, name):
     np.testing.assert_allclose(_sorted(ours), _sorted(theirs[area]), atol=1e-9)
 
 
-def _sorted(triangles: np.ndarray) -> np.ndarray:
+def _sorted(triangles):
     rows = np.round(triangles.reshape(len(triangles), -1), 9)
     return rows[np.lexsort(rows.T[::-1])]
 
@@ -71,10 +67,8 @@ def test_every_ycb_object_has_all_its_points_and_a_sane_size(ycb_root):
 
 @pytest.fixture
 def copied_root(ycb_root, tmp_path):
-    folder = tmp_path / "models" / "009_gelatin_box"
-    folder.mkdir(parents=True)
-    for path in (ycb_root / "models" / "009_gelatin_box").iterdir():
-        shutil.copyfile(path, folder / path.name)
+    folder = tmp_path / "models" / GELATIN
+    shutil.copytree(ycb_root / "models" / GELATIN, folder, copy_function=shutil.copyfile)
     return tmp_path
 
 
@@ -87,23 +81,22 @@ def test_an_unknown_object_lists_the_known_ones(copied_root):
 def test_a_folder_without_ycb_models_is_refused(tmp_path):
     for root in (tmp_path, tmp_path / "gone"):
         with pytest.raises(UserError, match=r"no models/NAME/points\.xyz; .*data\.root"):
-            ycb_part(root, "009_gelatin_box")
+            ycb_part(root, GELATIN)
 
 
 @pytest.mark.parametrize(
     "text", ["", "1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 x\n", "1 2 nan\n"], ids=repr
 )
 def test_damaged_points_are_refused(copied_root, text):
-    path = copied_root / "models" / "009_gelatin_box" / "points.xyz"
-    path.write_text(text)
+    (copied_root / "models" / GELATIN / "points.xyz").write_text(text)
     with pytest.raises(UserError, match=r"points\.xyz.*; allowed: lines of three finite numbers"):
-        ycb_part(copied_root, "009_gelatin_box")
+        ycb_part(copied_root, GELATIN)
 
 
 def test_a_broken_mesh_is_no_missing_mesh(copied_root):
-    mesh_path = copied_root / "models" / "009_gelatin_box" / "textured.obj"
+    mesh_path = copied_root / "models" / GELATIN / "textured.obj"
     mesh_path.write_bytes(mesh_path.read_bytes()[:500_000])
     with pytest.raises(UserError, match=r"textured\.obj"):
-        ycb_part(copied_root, "009_gelatin_box")
+        ycb_part(copied_root, GELATIN)
     mesh_path.unlink()
-    assert ycb_part(copied_root, "009_gelatin_box").mesh is None
+    assert ycb_part(copied_root, GELATIN).mesh is None

@@ -15,11 +15,11 @@ from dopepp.parts.mesh.read import body_extents
 from dopepp.parts.size import LearnedRange, enclosing_range, part_in_words, size_in_words
 
 
-def box(*extents: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+def box(*extents, at=(0, 0, 0)):
     return trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at))
 
 
-def inverted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def inverted(mesh):
     mesh.invert()
     return mesh
 
@@ -52,7 +52,7 @@ def test_an_open_surface_is_a_body():
 
 @pytest.fixture
 def written(tmp_path):
-    def write(*meshes: trimesh.Trimesh) -> str:
+    def write(*meshes):
         path = tmp_path / "bracket.stl"
         path.write_bytes(export_stl(trimesh.util.concatenate(meshes)))
         return str(path)
@@ -83,18 +83,16 @@ def test_several_bodies_are_logged_once(written, caplog):
     with caplog.at_level(logging.INFO):
         load_part(written(BRACKET, box(5, 5, 8, at=(100, 0, 0))), "mm")
     lines = [record.getMessage() for record in caplog.records if "bodies" in record.getMessage()]
-    assert lines == [
-        "bracket: 134 × 40 × 31 mm, read in mm; 2 bodies (62 × 40 × 31 mm, 8.0 × 5.0 × 5.0 mm), "
-        "which are rendered and detected as one part"
-    ]
+    sizes = "134 × 40 × 31 mm, read in mm; 2 bodies (62 × 40 × 31 mm, 8.0 × 5.0 × 5.0 mm)"
+    assert lines == [f"bracket: {sizes}, which are rendered and detected as one part"]
     many = [box(1 + n / 9, 1, 1, at=(5 * n, 0, 0)) for n in range(5)]
     words = part_in_words(load_part(written(*many), "cm"))
     assert "; 5 bodies (the largest 14 × 10 × 10 mm), which" in words
 
 
 def test_parts_without_a_file_have_no_unit():
-    assert part_in_words(servoholder()) == "servoholder: 77 × 77 × 7.0 mm"
-    assert part_in_words(replace(servoholder(), mesh=None)) == "servoholder: 77 × 77 × 7.0 mm"
+    for part in (servoholder(), replace(servoholder(), mesh=None)):
+        assert part_in_words(part) == "servoholder: 77 × 77 × 7.0 mm"
     assert size_in_words(np.array([0.0031, 0.2, 0.04])) == "200 × 40 × 3.1 mm"
 
 

@@ -8,19 +8,17 @@ from trimesh.creation import box, cone, cylinder, icosphere
 from trimesh.transformations import translation_matrix
 
 from dopepp.core.errors import UserError
-from dopepp.parts.part import Mesh
 from dopepp.parts.symmetry_finder import find_symmetries
+from tests.parts.makers import mesh_of
 
 
-def plate(*holes: tuple[float, float, float]) -> trimesh.Trimesh:
+def plate(*holes):
     """A plate of 100 × 60 × 6 with holes (x, y, radius)."""
-    cut = [
-        cylinder(r, 20, sections=48, transform=translation_matrix((x, y, 0))) for x, y, r in holes
-    ]
+    cut = [cylinder(r, 20, sections=48).apply_translation((x, y, 0)) for x, y, r in holes]
     return box((100, 60, 6)).difference(cut, engine="manifold")
 
 
-def bracket() -> trimesh.Trimesh:
+def bracket():
     """An L with unequal legs, extruded."""
     leg = box((20, 50, 10), transform=translation_matrix((-20, 15, 0)))
     return trimesh.boolean.union([box((60, 20, 10)), leg], engine="manifold")
@@ -46,11 +44,11 @@ SLOW = ("cube", "sphere", "triangular prism", "square prism", "hexagonal prism")
 """Shapes with many axes, which take long, and are tested moved and recut only."""
 
 
-def as_mesh(shape: trimesh.Trimesh) -> Mesh:
-    return Mesh(1e-3 * np.asarray(shape.vertices, np.float64), np.asarray(shape.faces, np.int32))
+def as_mesh(shape):
+    return mesh_of(shape.copy().apply_scale(1e-3))
 
 
-def moved(shape: trimesh.Trimesh, seed: int) -> trimesh.Trimesh:
+def moved(shape, seed):
     """Cut into smaller triangles, turned and shifted."""
     rng = np.random.default_rng(seed)
     copy = shape.subdivide_to_size(shape.scale / 5) if len(shape.faces) < 1000 else shape.copy()

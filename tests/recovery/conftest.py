@@ -1,59 +1,51 @@
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import random_rotation
 from dopepp.maps import MapGeometry, encode
+from dopepp.recovery import recover
 
 
 class Scene:
     """Poses of objects, and their perfect maps."""
 
-    def __init__(
-        self, cuboids: Sequence[np.ndarray], K: np.ndarray, cells: tuple[int, int] = (52, 52)
-    ) -> None:
-        self.cuboids, self.K, self.cells = np.stack(cuboids), K, cells
-        self.objects: list[int] = []
-        self.poses: list[np.ndarray] = []
+    def __init__(self, cuboids, K):
+        self.cuboids, self.K = np.stack(cuboids), K
+        self.objects, self.poses = [], []
 
-    def place(self, index: int, T_cam_obj: np.ndarray) -> Scene:
+    def place(self, index, T_cam_obj):
         self.objects.append(index)
         self.poses.append(T_cam_obj)
         return self
 
-    def maps(self, sigma: float = 1.0) -> tuple[Tensor, Tensor]:
-        points = [
-            project_keypoints(self.cuboids[c], T, self.K)
-            for c, T in zip(self.objects, self.poses, strict=True)
-        ]
+    def maps(self, sigma=1.0):
+        placed = zip(self.objects, self.poses, strict=True)
+        points = [project_keypoints(self.cuboids[index], T, self.K) for index, T in placed]
         belief, field = encode(
-            torch.tensor(np.array(points))[None],
-            torch.tensor(self.objects)[None],
-            len(self.cuboids),
-            self.cells,
-            MapGeometry(8, sigma),
-        )
+            torch.tensor(np.array(points))[None], torch.tensor(self.objects)[None],
+            len(self.cuboids), (52, 52), MapGeometry(8, sigma),
+        )  # fmt: skip
         return belief[0], field[0]
 
-    def errors(self, index: int, T_cam_obj: np.ndarray) -> list[float]:
+    def recover(self, belief=None, field=None, **options):
+        """Recover the poses from the given maps, or from the perfect ones."""
+        maps = self.maps() if belief is None else (belief, field)
+        return recover(*maps, self.cuboids, self.K, **options)
+
+    def errors(self, index, T_cam_obj):
         """Return the ADD between a pose and each instance of an object, diameters of the cuboid."""
         cuboid = self.cuboids[index]
-        moved = transform(T_cam_obj, cuboid)
-        diameter = np.linalg.norm(cuboid[0] - cuboid[6])
+        moved, diameter = transform(T_cam_obj, cuboid), np.linalg.norm(cuboid[0] - cuboid[6])
         return [
             float(np.linalg.norm(moved - transform(T, cuboid), axis=1).mean() / diameter)
             for c, T in zip(self.objects, self.poses, strict=True)
             if c == index
         ]
 
-    def error(self, index: int, T_cam_obj: np.ndarray) -> float:
+    def error(self, index, T_cam_obj):
         """Return the ADD between a pose and the nearest instance, diameters of the cuboid."""
         return min(self.errors(index, T_cam_obj))
 
@@ -76,20 +68,14 @@ def plate():
 
 @pytest.fixture
 def pose():
-    def draw(
-        rng: np.random.Generator, x: float = 0.0, y: float = 0.0, z: float = 0.4
-    ) -> np.ndarray:
+    def draw(rng, x=0.0, y=0.0, z=0.4):
         """Return a random rotation at a position (metres), shifted by up to a centimetre."""
-        return make_transform(
-            random_rotation(rng), rng.uniform(-0.01, 0.01, 3) + np.array([x, y, z])
-        )
+        R = random_rotation(rng)
+        return make_transform(R, rng.uniform(-0.01, 0.01, 3) + np.array([x, y, z]))
 
     return draw
 
 
 @pytest.fixture
 def make_scene(K):
-    def make(*cuboids: np.ndarray, camera: np.ndarray = K) -> Scene:
-        return Scene(cuboids, camera)
-
-    return make
+    return lambda *cuboids, camera=K: Scene(cuboids, camera)

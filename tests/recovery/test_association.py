@@ -21,35 +21,27 @@ from dopepp.recovery.association import (
 WIDE = math.radians(45)
 
 
-def peaks(
-    corners: np.ndarray, toward: np.ndarray, centroids: object, score: object = 1.0
-) -> ObjectPeaks:
+def peaks(corners, toward, centroids, score=1.0):
     """Return peaks at known positions, (8, n, 2); NaN for missing peaks."""
     centroid = np.array(centroids, float).reshape(-1, 2)
     is_present = np.isfinite(corners[..., 0])
-    return ObjectPeaks(
-        corners,
-        np.where(is_present, score, 0.0),
-        np.tile(np.eye(2), (*corners.shape[:2], 1, 1)),
-        toward,
-        centroid,
-        np.ones(len(centroid)),
-        np.tile(np.eye(2), (len(centroid), 1, 1)),
-        160_000.0,
-    )
+    scores, spread = np.where(is_present, score, 0.0), np.eye(2)
+    spreads = [np.tile(spread, (*shape, 1, 1)) for shape in (corners.shape[:2], (len(centroid),))]
+    ones = np.ones(len(centroid))
+    return ObjectPeaks(corners, scores, spreads[0], toward, centroid, ones, spreads[1], 160_000.0)
 
 
-def one_corner(position: object, toward: object, centroids: object, score: object = 1.0):
+def one_corner(position, toward, centroids, score=1.0):
     corners, vectors = np.full((2, 8, len(np.array(position)), 2), np.nan)
     corners[0], vectors[0] = position, toward
     return peaks(corners, vectors, centroids, score)
 
 
-def group(peaks: ObjectPeaks, max_angle: float = WIDE, coincident_px: float = 8.0):
+def group(peaks, max_angle=WIDE, coincident_px=8.0):
     return associate(peaks, direction_evidence(peaks, max_angle, coincident_px))
 
 
-def crowd(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+def crowd(rng, count):
     """Return affine projections of cuboids: corners (8, n, 2) and centroids (n, 2)."""
     centroids = rng.uniform(0, 400, (count, 2))
     affine = rng.normal(scale=25, size=(count, 2, 3))
@@ -92,9 +84,8 @@ def test_affine_camera_separates_corners_in_one_direction():
         toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
         toward += 0.05 * rng.normal(size=toward.shape)
         order = rng.permuted(np.tile(np.arange(6), (8, 1)), axis=1)[..., None]
-        result = peaks(
-            np.take_along_axis(corners, order, 1), np.take_along_axis(toward, order, 1), centroids
-        )
+        shuffled = (np.take_along_axis(values, order, 1) for values in (corners, toward))
+        result = peaks(*shuffled, centroids)
         for n, first in enumerate(group(result)):
             right += (first.position[:8] == corners[:, n]).all(1).sum()
             total += 8
@@ -144,7 +135,7 @@ def test_no_instance_without_a_centroid():
     assert group(one_corner([[1, 1]], [[1, 0]], np.zeros((0, 2)))) == []
 
 
-def error(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
+def error(T, truth, cuboid):
     if T is None:
         return np.inf
     return float(np.linalg.norm(transform(T, cuboid) - transform(truth, cuboid), axis=1).mean())
@@ -159,10 +150,8 @@ def test_wide_peaks_have_less_weight(box, K, pose):
         noise = np.array([0.3] * 5 + [6.0] * 4)
         pixels = project_keypoints(box, truth, K) + rng.normal(size=(9, 2)) * noise[:, None]
         honest = noise[:, None, None] ** 2 * np.eye(2)
-        groups = [
-            KeypointGroup(pixels, np.ones(9), covariance)
-            for covariance in (honest, np.tile(9.0 * np.eye(2), (9, 1, 1)))
-        ]
+        equal = np.tile(9.0 * np.eye(2), (9, 1, 1))
+        groups = (KeypointGroup(pixels, np.ones(9), spread) for spread in (honest, equal))
         errors.append([error(solve_group(group, box, K).T_cam_obj, truth, box) for group in groups])
     true_error, equal_error = np.median(errors, axis=0)
     assert true_error < 0.5 * equal_error

@@ -11,9 +11,8 @@ from scipy.special import expit
 from scipy.stats import chi2
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
+from dopepp.geometry.camera import camera_matrix, move_pose, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.recovery.detection import (
     DISTANCE_FACTORS,
     FEATURES,
@@ -26,18 +25,17 @@ from dopepp.recovery.detection import (
     fit_weights,
     recalibrate,
     score,
-)
+)  # fmt: skip
 
 K = camera_matrix(600, 600, 320, 240)
 CUBOID = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))
-T = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), np.array([0.02, 0, 0.6]))
+T = move_pose(np.eye(4), np.array([0.3, -0.2, 1.0, 0.02, 0, 0.6]))
 
 
-def detection(**changes: object) -> Detection:
+def detection(**changes):
     keypoints, covariance = project(transform(T, CUBOID), K), np.diag([1e-4] * 3 + [1e-6] * 3)
-    return replace(
-        Detection("box", 0.5, 0.5, T, keypoints, keypoints.copy(), 1.0, covariance), **changes
-    )
+    whole = Detection("box", 0.5, 0.5, T, keypoints, keypoints.copy(), 1.0, covariance)
+    return replace(whole, **changes)
 
 
 def test_without_fitted_weights_the_score_is_the_mean_belief():
@@ -51,10 +49,8 @@ def test_spread_is_the_rms_error_of_sampled_poses():
     rng = np.random.default_rng(0)
     root = rng.normal(0, 1, (6, 6)) * [0.01, 0.01, 0.01, 0.001, 0.001, 0.001]
     covariance = root.T @ root
-    moved = []
-    for step in rng.multivariate_normal(np.zeros(6), covariance, 4000):
-        turned = rotation_vector_to_matrix(step[:3]) @ T[:3, :3]
-        moved.append(transform(make_transform(turned, T[:3, 3] + step[3:]), CUBOID[:8]))
+    steps = rng.multivariate_normal(np.zeros(6), covariance, 4000)
+    moved = [transform(move_pose(T, step), CUBOID[:8]) for step in steps]
     distance = np.linalg.norm(np.array(moved) - transform(T, CUBOID[:8]), axis=2)
     size = np.linalg.norm(CUBOID[0] - CUBOID[6])
     expected = np.log(np.sqrt((distance**2).mean()) / size / 0.1)
@@ -68,15 +64,12 @@ def test_the_distance_changes_along_the_ray_through_the_origin():
     assert np.array_equal(after.T_cam_obj[:3, :3], T[:3, :3])
     assert np.allclose(after.T_cam_obj[:3, 3], [0.018, 0, 0.54], atol=1e-15)
     # The origin stays where it is in the image; the measured peaks stay as they are.
-    origin = np.zeros((1, 3))
-    assert np.allclose(
-        project(transform(after.T_cam_obj, origin), K), project(transform(T, origin), K)
-    )
+    origins = (project(item[:3, 3], K) for item in (after.T_cam_obj, T))
+    assert np.allclose(*origins)
     assert np.allclose(after.keypoints, project(transform(after.T_cam_obj, CUBOID), K))
     assert np.array_equal(after.peaks, before.peaks)
     assert after.score == before.belief
-    same = calibrate(before, CUBOID, K, RecoveryOptions())
-    assert np.array_equal(same.T_cam_obj, T)
+    assert np.array_equal(calibrate(before, CUBOID, K, RecoveryOptions()).T_cam_obj, T)
 
 
 def test_the_factor_is_the_median_ratio_of_distances():
@@ -157,9 +150,8 @@ def test_refined_score_is_the_verified_probability():
     ]
     scores = [estimate.score for estimate in recalibrate(judged, RecoveryOptions())]
     assert scores == pytest.approx([0.8, 0.5, 0.2])
-    fitted = RecoveryOptions(
-        min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_verification=0.5
-    )
+    weights = {"refined_bias": -2.0, "refined_score": 1.0, "refined_verification": 0.5}
+    fitted = RecoveryOptions(min_score=0.5, **weights)
     assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
     best = max(recalibrate(judged, fitted), key=lambda estimate: estimate.score)
     assert best.score == 0.5
@@ -188,14 +180,12 @@ def test_few_refined_poses_hardly_change_the_weights():
 def test_features_show_missing_keypoints_and_worse_fits():
     peaks = project(transform(T, CUBOID), K)
     peaks[[1, 4, 6]] = np.nan
+    both = detection(), detection(peaks=peaks, reprojection_error_px=5.0)
     whole, poor = (
-        detection_features(item, CUBOID, K)
-        for item in (detection(), detection(peaks=peaks, reprojection_error_px=5.0))
+        dict(zip(FEATURES, detection_features(item, CUBOID, K), strict=True)) for item in both
     )
-    assert whole[FEATURES.index("found")] == 0
-    assert poor[FEATURES.index("found")] == pytest.approx(-3 / 9)
-    misfit = FEATURES.index("misfit")
-    assert poor[misfit] - whole[misfit] == pytest.approx(np.log(5))
+    assert (whole["found"], poor["found"]) == (0, pytest.approx(-3 / 9))
+    assert poor["misfit"] - whole["misfit"] == pytest.approx(np.log(5))
 
 
 def test_corners_behind_the_camera_are_ignored():
@@ -221,13 +211,10 @@ def test_the_fit_is_the_maximum_of_the_likelihood():
     truth = np.array([0.5, 1.5, -1.0, 0.0, 0.3])
     correct = rng.random(400) < score(features, truth)
 
-    def loss(weights: np.ndarray) -> float:
+    def loss(weights):
         log_odds = features @ weights
-        return float(
-            np.logaddexp(0, log_odds).sum()
-            - log_odds[correct].sum()
-            + 0.05 * (weights[1:] ** 2).sum()
-        )
+        ridge = 0.05 * (weights[1:] ** 2).sum()
+        return np.logaddexp(0, log_odds).sum() - log_odds[correct].sum() + ridge
 
     fitted = fit_weights(features, correct)
     np.testing.assert_allclose(fitted, minimize(loss, np.zeros(5), tol=1e-12).x, atol=1e-4)

@@ -30,7 +30,7 @@ def test_all_instances_are_recovered(name, count, box, plate, make_scene, pose):
             T = pose(rng, x, y, 0.55)
             T[:3, 3] -= T[:3, :3] @ cuboid[8]
             scene.place(0, T)
-        detections = recover(*scene.maps(), scene.cuboids, scene.K)
+        detections = scene.recover()
         assert len(detections) == count
         assert max(scene.error(0, estimate.T_cam_obj) for estimate in detections) < 0.1
         centres = [transform(detection.T_cam_obj, cuboid[8])[:2] for detection in detections]
@@ -43,13 +43,8 @@ def test_two_objects_in_one_network(make_scene, box, plate, pose):
         scene = make_scene(box, plate)
         for index, (x, y) in zip([0, 1, 1, 0], PLACES, strict=True):
             scene.place(index, pose(rng, x, y, 0.55))
-        detections = recover(*scene.maps(), scene.cuboids, scene.K, names=["box", "plate"])
-        assert sorted(estimate.object for estimate in detections) == [
-            "box",
-            "box",
-            "plate",
-            "plate",
-        ]
+        detections = scene.recover(names=["box", "plate"])
+        assert sorted(item.object for item in detections) == ["box", "box", "plate", "plate"]
         for detection in detections:
             assert scene.error(["box", "plate"].index(detection.object), detection.T_cam_obj) < 0.1
 
@@ -63,7 +58,7 @@ def test_three_corners_may_be_missing(name, request, make_scene, pose):
         belief, field = scene.maps()
         missing = rng.permutation(8)[:3]
         belief[missing] = 0
-        detections = recover(belief, field, scene.cuboids, scene.K)
+        detections = scene.recover(belief, field)
         good += len(detections) == 1 and scene.error(0, detections[0].T_cam_obj) < 0.1
         for detection in detections:
             assert np.isnan(detection.peaks[missing]).all()
@@ -74,7 +69,7 @@ def test_three_corners_may_be_missing(name, request, make_scene, pose):
 
 def test_fields_of_a_detection(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(4)))
-    (detection,) = recover(*scene.maps(), scene.cuboids, scene.K, names=["bracket"])
+    (detection,) = scene.recover(names=["bracket"])
     assert detection.object == "bracket"
     assert 0.8 < detection.score <= 1
     truth = project_keypoints(box, scene.poses[0], scene.K)
@@ -92,20 +87,17 @@ def test_best_score_is_first_and_at_most_one(make_scene, box, pose):
     belief, field = scene.maps()
     belief[:, :, :26] *= 0.5
     belief[:, :, 26:] *= 1.7  # an identity activation does not bound beliefs
-    first, second = recover(belief, field, scene.cuboids, scene.K, min_score=0.0)
+    first, second = scene.recover(belief, field, min_score=0.0)
     assert first.T_cam_obj[0, 3] > 0 > second.T_cam_obj[0, 3]
     assert 1 >= first.score > second.score >= 0
-    assert len(recover(belief, field, scene.cuboids, scene.K, min_score=0.7)) == 1
-    assert len(recover(belief, field, scene.cuboids, scene.K, centroid_threshold=0.7)) == 1
+    for option in ("min_score", "centroid_threshold"):
+        assert len(scene.recover(belief, field, **{option: 0.7})) == 1
 
 
 def test_absent_object_is_not_detected(make_scene, box, plate, pose):
     scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
-    belief, field = scene.maps()
-    assert [detection.object for detection in recover(belief, field, scene.cuboids, scene.K)] == [
-        "1"
-    ]
-    assert recover(0 * belief, 0 * field, scene.cuboids, scene.K) == []
+    assert [detection.object for detection in scene.recover()] == ["1"]
+    assert scene.recover(*(0 * maps for maps in scene.maps())) == []
 
 
 def test_batch_equals_its_single_images(make_scene, box, plate, pose):
@@ -121,7 +113,7 @@ def test_batch_equals_its_single_images(make_scene, box, plate, pose):
     belief, field = (torch.stack(kind) for kind in zip(*maps, strict=True))
     batch = recover_batch(belief, field, scenes[0].cuboids, np.stack(cameras))
     for scene, detections, (single_belief, single_field) in zip(scenes, batch, maps, strict=True):
-        alone = recover(single_belief, single_field, scene.cuboids, scene.K)
+        alone = scene.recover(single_belief, single_field)
         assert len(detections) == len(alone) == 2
         for detection, other in zip(detections, alone, strict=True):
             assert detection.object == other.object
@@ -150,11 +142,9 @@ def test_maps_in_half_precision_and_channels_last(make_scene, box, pose):
     ],
 )
 def test_bad_option(option, value, make_scene, box):
-    scene = make_scene(box)
+    maps = torch.zeros(9, 8, 8), torch.zeros(16, 8, 8)
     with pytest.raises(UserError, match=f"recovery.{option}={value}"):
-        recover(
-            torch.zeros(9, 8, 8), torch.zeros(16, 8, 8), scene.cuboids, scene.K, **{option: value}
-        )
+        make_scene(box).recover(*maps, **{option: value})
 
 
 @pytest.mark.parametrize(
@@ -182,7 +172,7 @@ def test_few_corners_and_small_parts_are_reasons(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
     belief, field = scene.maps()
     belief[:6] = 0
-    assert recover(belief, field, scene.cuboids, scene.K) == []
+    assert scene.recover(belief, field) == []
     (few,) = explain(belief, field, scene.cuboids, scene.K)
     assert "only 3 usable points, 4 are needed" in few.text
     scene = make_scene(box).place(0, make_transform(np.eye(3), np.array([0.0, 0.0, 15.0])))
@@ -201,9 +191,8 @@ def test_reasons_are_formatted_in_a_line():
         reason("refined", 0.1, "box"), reason("empty", 0.0, "disc"),
     ]  # fmt: skip
     line = "box: refined 0.1; plate: score 0.2 (the best of 4); disc: empty 0.0"
-    assert [str(item) for item in reversed(main_reasons(reasons))] == line.replace(
-        " (the best of 4)", ""
-    ).split("; ")
+    parts = [str(item) for item in reversed(main_reasons(reasons))]
+    assert parts == line.replace(" (the best of 4)", "").split("; ")
     assert (format_reasons(reasons), format_reasons([])) == (line, "")
     assert summary([*reasons[1:3], reasons[-1]], 300) == (
         "3 of 300 images without detections: 1 with empty maps (best belief 0), "
@@ -226,8 +215,7 @@ def test_crowds_are_recovered_from_noisy_maps(name, sigma, request, make_scene, 
         field = field + 0.05 * torch.randn(field.shape, generator=generator)
         # Fits to further peaks of the noise must not widen the covariances of the parts' peaks.
         for max_peaks in (16, 100):
-            options = {"sigma": sigma, "max_peaks": max_peaks}
-            detections = recover(belief, field, scene.cuboids, scene.K, **options)
+            detections = scene.recover(belief, field, sigma=sigma, max_peaks=max_peaks)
             errors = np.array([scene.errors(0, detection.T_cam_obj) for detection in detections])
             right += int((errors.min(0) < 0.1).sum())
     assert right >= 72
@@ -235,8 +223,7 @@ def test_crowds_are_recovered_from_noisy_maps(name, sigma, request, make_scene, 
 
 def test_wider_peaks_yield_a_larger_covariance(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(12)))
-    (sharp,) = recover(*scene.maps(), scene.cuboids, scene.K)
-    (wide,) = recover(*scene.maps(1.5), scene.cuboids, scene.K)
+    (sharp,), (wide,) = scene.recover(), scene.recover(*scene.maps(1.5))
     for detection in (sharp, wide):
         assert_allclose(detection.covariance, detection.covariance.T, rtol=1e-6)
         assert np.linalg.eigvalsh(detection.covariance).min() > 0
@@ -248,8 +235,7 @@ def test_peaks_at_the_border_are_less_certain():
     position = np.full((1, 9, 6, 2), np.nan)
     position[0, 0] = inside + outside
     covariance = np.tile(np.diag([2.0, 3.0]), (1, 9, 6, 1, 1))
-    score = np.ones((1, 9, 6))
-    peaks = Peaks(position, score, covariance, np.zeros((1, 9, 6, 2)))
+    peaks = Peaks(position, np.ones((1, 9, 6)), covariance, np.zeros((1, 9, 6, 2)))
     selected = select_peaks(peaks, 0, 0, 0.05, (10, 6), 8.0)
     added = selected.covariance_px[0] - covariance[0, 0]
     assert_array_equal(added[:2], 0.0)

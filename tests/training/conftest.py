@@ -1,18 +1,14 @@
-from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
 from torch import nn
 
-from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.rendered import RenderedSource, Split
-from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.data.rendered import RenderedSource
+from dopepp.data.sample import Instance, Sample
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.backbones import Backbone
 from dopepp.models.checkpoint import Checkpoint
@@ -35,21 +31,20 @@ NOISE_SIZE = 32
 class OneLayer(Backbone):
     """One convolution, because these tests do not depend on the network."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.out_channels = 4
         self.layers = nn.Sequential(nn.Conv2d(3, 4, 8, 8), nn.BatchNorm2d(4), nn.ReLU())
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(images)
-        return features
+    def forward(self, images):
+        return self.layers(images)
 
 
 class Pointwise(Head):
     """One 1×1 convolution each for beliefs and field."""
 
     def __init__(self, in_channels: int, num_objects: int, activation: str = "identity") -> None:
-        def make_branch(inputs: int, outputs: int, stage: int) -> ChainBranch:
+        def make_branch(inputs, outputs, stage):
             return ChainBranch(nn.Conv2d(inputs, outputs, 1))
 
         super().__init__(in_channels, num_objects, activation, 1, make_branch)
@@ -67,9 +62,7 @@ def make_system(part):
     BACKBONES.register(backbone)
     HEADS.register(head)
 
-    def make(
-        num_objects: int = 1, system_class: type[PoseSystem] = PoseSystem, **options: Any
-    ) -> PoseSystem:
+    def make(num_objects=1, system_class=PoseSystem, **options):
         torch.manual_seed(0)
         parts = [part, Part("other", part.cuboid, part.diameter, part.points)][:num_objects]
         loss = SpatialCrossEntropy(sigma=1.0, count_weight=1.0, field_weight=0.2)
@@ -81,17 +74,10 @@ def make_system(part):
             "num_objects": num_objects,
         }
         network = build_network(spec)
-        described = Checkpoint(spec, {}, parts, INPUT_SIZE, network.stride, 1.0)
-        return system_class(
-            network,
-            loss,
-            parts,
-            MapGeometry(network.stride),
-            RecoveryOptions(),
-            options.pop("make_optimizer", partial(torch.optim.Adam, lr=3e-3)),
-            payload=described.to_payload(),
-            **options,
-        )
+        payload = Checkpoint(spec, {}, parts, INPUT_SIZE, network.stride, 1.0).to_payload()
+        options = {"make_optimizer": partial(torch.optim.Adam, lr=3e-3)} | options
+        geometry, recovery = MapGeometry(network.stride), RecoveryOptions()
+        return system_class(network, loss, parts, geometry, recovery, payload=payload, **options)
 
     return make
 
@@ -100,11 +86,10 @@ def make_system(part):
 def make_datamodule(part):
     """Eight training and three validation renders in batches of two."""
 
-    def source(num_items: int, split: Split) -> RenderedSource:
-        return RenderedSource(Factory([part], PRESETS["quickstart"], seed=0), num_items, split)
-
-    def make() -> PoseDataModule:
-        sources = (source(8, "train"), source(3, "val"), source(1, "test"))
+    def make():
+        factory = Factory([part], PRESETS["quickstart"], seed=0)
+        splits = {"train": 8, "val": 3, "test": 1}
+        sources = [RenderedSource(factory, number, split) for split, number in splits.items()]
         return PoseDataModule(*sources, [part.name], INPUT_SIZE, batch_size=2)
 
     return make
@@ -113,8 +98,7 @@ def make_datamodule(part):
 @pytest.fixture(scope="session")
 def batch(make_datamodule):
     """Two rendered images, which tests must not change."""
-    first: Batch = next(iter(make_datamodule().val_dataloader()))
-    return first
+    return next(iter(make_datamodule().val_dataloader()))
 
 
 class Noise:
@@ -122,22 +106,22 @@ class Noise:
 
     name = "noise"
 
-    def __init__(self, num_images: int, part: Part) -> None:
+    def __init__(self, num_images, part):
         self.num_images, self.part = num_images, part
 
-    def __len__(self) -> int:
+    def __len__(self):
         return self.num_images
 
-    def sample(self, index: int, epoch: int = 0) -> Sample:
+    def sample(self, index, epoch=0):
         rng = np.random.default_rng([epoch, index])
         image = rng.integers(0, 255, (NOISE_SIZE, NOISE_SIZE, 3), np.uint8)
         keypoints = rng.uniform(0, NOISE_SIZE, (9, 2))
         return Sample(image, np.eye(3), [Instance(self.part.name, np.eye(4), keypoints)])
 
-    def describe(self) -> list[SourceInfo]:
+    def describe(self):
         return []
 
-    def contains(self, label: str) -> bool:
+    def contains(self, label):
         return True
 
 
@@ -145,7 +129,7 @@ class Noise:
 def make_noise(part):
     """Eight training and four validation images of noise in batches of two."""
 
-    def make() -> PoseDataModule:
+    def make():
         sources = [Noise(number, part) for number in (8, 4, 1)]
         return PoseDataModule(*sources, [part.name], (NOISE_SIZE, NOISE_SIZE), batch_size=2)
 
@@ -156,7 +140,7 @@ def make_noise(part):
 def make_trainer():
     """Return a trainer of one epoch that logs every step to its folder's table."""
 
-    def make(folder: Path, callbacks: Sequence[Callback], **options: Any) -> Trainer:
+    def make(folder, callbacks, **options):
         table = MetricsTable(folder / "metrics.csv")
         defaults = {
             "accelerator": "cpu", "max_epochs": 1, "num_sanity_val_steps": 0, "logger": table,

@@ -3,20 +3,16 @@
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import TQDMProgressBar
 
 from dopepp.core.files import read_csv
-from dopepp.data.batch import Batch
-from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.pictures import read_rgb
 from dopepp.metrics.pose import PoseMetrics
-from dopepp.recovery.detection import Detection
 from dopepp.training import throughput
 from dopepp.training.pose_validation import (
     LOGGED,
@@ -32,23 +28,23 @@ from dopepp.training.throughput import Operators, Throughput, make_profiler, pro
 class Displaced(PoseSystem):
     """Returns the target maps; the first image's maps of every batch are shifted by two cells."""
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
+    def validation_step(self, batch, batch_idx):
         belief, field = self.targets(batch)
-        belief[::2] = belief[::2].roll(2, dims=-1)
-        field[::2] = field[::2].roll(2, dims=-1)
+        for maps in (belief, field):
+            maps[::2] = maps[::2].roll(2, dims=-1)
         return ValidationOutput(belief.new_zeros(()), belief, field)
 
 
 class Recorder(Callback):
-    def __init__(self) -> None:
-        self.detections: list[list[Detection]] = []
-        self.logged: dict[str, float] = {}
+    """Keeps the detections of the validation and the values that are logged at the end."""
 
-    def on_validation_batch_end(self, trainer: Trainer, system: PoseSystem, *args: Any) -> None:
-        outputs, batch, *_ = args
+    def __init__(self):
+        self.detections, self.logged = [], {}
+
+    def on_validation_batch_end(self, trainer, system, outputs, batch, *_):
         self.detections += system.recover(outputs, batch)
 
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_end(self, trainer, system):
         self.logged = {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
@@ -56,7 +52,7 @@ class Recorder(Callback):
 def validate(make_trainer, tmp_path):
     """Train one epoch; return the detections and logged values of its validation."""
 
-    def fit(system: PoseSystem, data: PoseDataModule) -> Recorder:
+    def fit(system, data):
         recorder = Recorder()
         shown = [PoseMetricsCallback(), AUCCurves(), Overlays(2), Throughput()]
         trainer = make_trainer(tmp_path, [*shown, recorder], enable_checkpointing=False)
@@ -78,10 +74,9 @@ def test_metrics_images_and_throughput(validate, make_system, make_datamodule, t
     assert len(recorder.detections) == 3
     mean = metrics.compute()["mean"]
     assert mean.num_instances == 3
-    for name in LOGGED:
-        assert recorder.logged[f"val/{name}"] == pytest.approx(getattr(mean, name), rel=1e-4)
-    # An intermediate value makes the comparison meaningful.
-    assert 0 < recorder.logged["val/auc_10cm"] < 1
+    logged = {name: recorder.logged[f"val/{name}"] for name in LOGGED}
+    assert logged == pytest.approx({name: getattr(mean, name) for name in LOGGED}, rel=1e-4)
+    assert 0 < logged["auc_10cm"] < 1  # otherwise the comparison has no meaning
 
     # The curves and their table agree with the metrics.
     assert read_rgb(tmp_path / "val_auc.png").std() > 0
@@ -94,15 +89,13 @@ def test_metrics_images_and_throughput(validate, make_system, make_datamodule, t
     assert ((green > 150) & (red < 100) & (blue < 100)).any()
     assert ((green > 180) & (red > 180) & (blue < 80)).any()
 
-    # Throughput is in the table.
+    # Throughput is in the table, and logged once per epoch.
     last = read_csv(tmp_path / "metrics.csv")[-1]
     assert float(last["throughput/images_per_s"]) > 0
     assert 0 <= float(last["throughput/loader_wait"]) <= 1
-    assert float(last["val/auc_10cm"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
-    assert float(last["val/selection"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
+    for name in ("val/auc_10cm", "val/selection"):
+        assert float(last[name]) == pytest.approx(mean.auc_10cm, rel=1e-4)
     assert 0 < float(last["val/ar_mspd"]) < 1
-
-    # … and logged once per epoch.
     lines = [r.getMessage() for r in caplog.records if "images/s" in r.getMessage()]
     assert len(lines) == len({line.partition(":")[0] for line in lines}) > 0
     assert "% of the time waiting for the loader" in lines[0]
@@ -121,7 +114,7 @@ def test_a_batch_contains_the_instances_of_its_samples(part, batch, make_datamod
 
 def test_a_validation_without_instances_logs_nan(validate, make_system, make_noise):
     class Blind(Displaced):
-        def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
+        def validation_step(self, batch, batch_idx):
             batch.object_index[:] = -1
             return super().validation_step(batch, batch_idx)
 
@@ -139,7 +132,7 @@ def test_the_bar_shows_add_s_of_a_symmetric_part(symmetries, measure, part, make
     item = make_datamodule().val_item(0, 0)
     callback.metrics.update([], item.instances, item.K, item.size[0])
 
-    def log(name: str, value: float, prog_bar: bool, rank_zero_only: bool) -> None:
+    def log(name, value, prog_bar, rank_zero_only):
         on_bar.extend([name] if prog_bar else [])
 
     callback.on_validation_epoch_end(None, SimpleNamespace(log=log))
@@ -151,8 +144,8 @@ def test_the_remaining_time_is_of_the_whole_run(monkeypatch):
     monkeypatch.setattr(TQDMProgressBar, "get_metrics", lambda *_: {"train/loss": 1.0})
     now = [100.0]
     monkeypatch.setattr(throughput.time, "monotonic", lambda: now[0])
-    trainer: Any = SimpleNamespace(global_step=50, estimated_stepping_batches=250)
-    bar: Any = throughput.RunProgress()
+    trainer = SimpleNamespace(global_step=50, estimated_stepping_batches=250)
+    bar = throughput.RunProgress()
     bar.on_train_start(trainer, None)
     assert "left" not in bar.get_metrics(trainer, None)
     # A run resumed at step 50 took a minute for 20 steps, so 180 steps take 9 minutes.
@@ -163,7 +156,7 @@ def test_the_remaining_time_is_of_the_whole_run(monkeypatch):
 
 
 def test_the_simple_profiler_lists_the_slowest_hooks(tmp_path):
-    profiler: Any = make_profiler("simple", tmp_path)
+    profiler = make_profiler("simple", tmp_path)
     profiler.recorded_durations = {"step": [0.25, 0.75], "save": [0.125], "rest": [0.0]}
     assert profile_rows(profiler, limit=2) == [
         {"what": "step", "calls": "2", "s": "1.000", "ms/call": "500.00"},

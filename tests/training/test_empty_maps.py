@@ -3,30 +3,28 @@
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from dopepp.data.batch import Batch
 from dopepp.training.guards import EmptyMaps
-from dopepp.training.system import PoseSystem, ValidationOutput
+from dopepp.training.system import ValidationOutput
 
-CAUSES = ("too few training steps", "a learning rate", "labels or units")
+STEPS, RATE, LABELS = "too few training steps", "a learning rate", "labels or units"
 
 
 class Validations:
     """Calls a callback with validations of one batch."""
 
-    def __init__(self, system: PoseSystem, batch: Batch, patience: int = 2) -> None:
-        self.system, self.batch, self.callback = system, batch, EmptyMaps(patience)
-        self.trainer: Any = SimpleNamespace(
+    def __init__(self, system, batch):
+        self.system, self.batch, self.callback = system, batch, EmptyMaps(patience=2)
+        self.trainer = SimpleNamespace(
             world_size=1, is_global_zero=True, global_step=0, estimated_stepping_batches=1000,
             callback_metrics={}, optimizers=[SimpleNamespace(param_groups=[{"lr": 0.5}])],
         )  # fmt: skip
 
-    def __call__(self, highest: float, loss: float, channel: int = 0) -> None:
+    def __call__(self, highest, loss, channel=0):
         belief = torch.zeros(2, 9, 16, 16)
         belief[:, channel, 3, 4] = highest
         output = ValidationOutput(torch.tensor(loss), belief, torch.zeros(2, 16, 16, 16))
@@ -35,6 +33,9 @@ class Validations:
         self.callback.on_validation_epoch_start(self.trainer, self.system)
         self.callback.on_validation_batch_end(self.trainer, self.system, output, self.batch, 0)
         self.callback.on_validation_end(self.trainer, self.system)
+
+    def end(self):
+        self.callback.on_train_end(self.trainer, self.system)
 
 
 @pytest.fixture
@@ -46,16 +47,15 @@ def validations(make_system, batch):
     return Validations(make_system(), batch)
 
 
-def first_cause(caplog: pytest.LogCaptureFixture) -> str:
+def first_cause(caplog):
     (warning,) = caplog.messages
     caplog.clear()
-    lines = warning.splitlines()
-    assert lines[0].startswith("all belief maps are empty")
+    title, first, *_ = lines = warning.splitlines()
+    assert title.startswith("all belief maps are empty")
     assert len(lines) == 4
-    for cause in CAUSES:
-        assert warning.count(cause) == 1
-    assert "(likely here)" in lines[1]
-    return lines[1]
+    assert [warning.count(cause) for cause in (STEPS, RATE, LABELS)] == [1, 1, 1]
+    assert "(likely here)" in first
+    return first
 
 
 @pytest.fixture(autouse=True)
@@ -68,20 +68,17 @@ def test_a_falling_loss_needs_more_steps(validations, caplog):
     assert not caplog.messages
     validations(0.001, 1.0)
     cause = first_cause(caplog)
-    assert "too few training steps" in cause
+    assert STEPS in cause
     assert "step 20 of 1,000" in cause
     validations(0.001, 0.9)
-    validations.callback.on_train_end(validations.trainer, validations.system)
+    validations.end()
     assert not caplog.messages  # it warns once
-
-
-LABELS = "labels or units"
 
 
 @pytest.mark.parametrize(
     ("scale", "shift", "index", "loss", "cause", "text"),
     [
-        (1.0, 0.0, 0, 2.0, "a learning rate", "from 2 to 2, the rate is 0.5"),
+        (1.0, 0.0, 0, 2.0, RATE, "from 2 to 2, the rate is 0.5"),
         (1.0, 1e4, 0, 1.0, LABELS, "0 % of the keypoints are inside"),
         (1e-3, 50.0, 0, 1.0, LABELS, "0.0 cells of the maps wide"),
         (1.0, float("nan"), 0, 1.0, LABELS, "0 % of the keypoints are inside"),
@@ -108,8 +105,8 @@ def test_a_short_training_warns_at_its_end_and_a_resumed_training_continues_the_
 ):
     validations(0.001, 2.0)
     state = validations.callback.state_dict()
-    validations.callback.on_train_end(validations.trainer, validations.system)
-    assert "too few training steps" in first_cause(caplog)
+    validations.end()
+    assert STEPS in first_cause(caplog)
     validations.callback = EmptyMaps(patience=2)
     validations.callback.load_state_dict(state)
     validations(0.001, 1.0)
@@ -124,5 +121,5 @@ def test_a_pose_needs_both_corners_and_centroids(validations, caplog):
         caplog.clear()
     validations.callback = EmptyMaps(patience=1)
     validations(0.9, 2.0, slice(None))
-    validations.callback.on_train_end(validations.trainer, validations.system)
+    validations.end()
     assert not caplog.messages

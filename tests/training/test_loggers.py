@@ -1,5 +1,4 @@
 import logging
-from collections.abc import Callable
 
 import pytest
 from lightning.pytorch.loggers import Logger
@@ -31,7 +30,7 @@ def test_a_failing_write_keeps_the_old_file_and_the_rows(tmp_path, monkeypatch, 
     before = table.path.read_bytes()
     table.log_metrics({"loss": 1.0}, step=1)
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
@@ -52,21 +51,15 @@ def test_an_existing_file_is_continued(tmp_path):
     for step in range(4):
         first.log_metrics({"loss": 4.0 - step}, step=step)
     first.save()
-
     second = MetricsTable(path)
     second.forget_after(1)
     second.log_metrics({"loss": 9.0, "rate": 0.1}, step=2)
     second.save()
-    assert [(row["step"], row["loss"], row["rate"]) for row in read_csv(path)] == [
-        ("0", "4.0", ""), ("1", "3.0", ""), ("2", "9.0", "0.1"),
-    ]  # fmt: skip
+    rows = [(row["step"], row["loss"], row["rate"]) for row in read_csv(path)]
+    assert rows == [("0", "4.0", ""), ("1", "3.0", ""), ("2", "9.0", "0.1")]
 
 
 CALLS = ("construction", "name", "log_hyperparams", "log_metrics", "save", "finalize")
-
-
-def recording(call: str) -> Callable[..., None]:
-    return lambda logger, *_, **__: logger._record(call)
 
 
 class Broken(Logger):
@@ -74,46 +67,43 @@ class Broken(Logger):
 
     version = ""
 
-    def __init__(self, failing: str = "") -> None:
+    def __init__(self, failing=""):
         super().__init__()
-        self.failing = failing
-        self.calls: list[str] = []
+        self.failing, self.calls = failing, []
         self._record("construction")
 
-    def _record(self, call: str) -> None:
+    def _record(self, call):
         self.calls.append(call)
         if call == self.failing:
             raise ConnectionError(f"{call} failed")
 
     @property
-    def name(self) -> str:
+    def name(self):
         self._record("name")
         return "broken"
 
-    log_hyperparams, log_metrics, save, finalize = (recording(item) for item in CALLS[2:])
-
-
-def use(logger: GuardedLogger) -> None:
-    assert logger.name in (None, "broken")
-    logger.log_hyperparams({})
-    for step in range(3):
-        logger.log_metrics({"loss": 1.0}, step)
-        logger.save()
-    logger.finalize("success")
-    assert logger.version in (None, "")
+    log_hyperparams, log_metrics, save, finalize = (
+        lambda self, *_, call=call, **__: self._record(call) for call in CALLS[2:]
+    )
 
 
 @pytest.mark.parametrize("call", ["", *CALLS])
 def test_a_failing_logger_warns_once_and_is_disabled(call, caplog):
-    made: list[Broken] = []
+    made = []
 
-    def make() -> Broken:
+    def make():
         made.append(Broken(call))
         return made[-1]
 
     with caplog.at_level(logging.WARNING):
         logger = GuardedLogger(make)
-        use(logger)
+        assert logger.name in (None, "broken")
+        logger.log_hyperparams({})
+        for step in range(3):
+            logger.log_metrics({"loss": 1.0}, step)
+            logger.save()
+        logger.finalize("success")
+        assert logger.version in (None, "")
     if not call:  # the logger works and receives all calls
         assert set(made[0].calls) == set(CALLS)
         assert not caplog.records

@@ -6,13 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 from dopepp.training import processes
 from dopepp.training.processes import Watch
 
 
-def sleeper(code: str = "import time; time.sleep(60)") -> subprocess.Popen[bytes]:
+def sleeper(code="import time; time.sleep(60)"):
     return subprocess.Popen([sys.executable, "-c", code])
 
 
@@ -36,7 +35,7 @@ def test_a_death_is_described_with_its_cause():
             process.wait()
 
 
-def hang(errors: Path) -> None:
+def hang(errors):
     sys.stderr = errors.open("w")
     processes._POLL_S = processes._GRACE_S = 0.2
     Watch([sleeper("import os; os.kill(os.getpid(), 9)")], None).start()

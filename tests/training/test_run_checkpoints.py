@@ -1,7 +1,6 @@
 import errno
 import os
 import subprocess
-from typing import Any
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ def test_loading_runs_no_code(weights_only, tmp_path):
     path, trace = tmp_path / "hostile.ckpt", tmp_path / "trace"
 
     class Hostile:
-        def __reduce__(self) -> tuple[Any, tuple[str]]:
+        def __reduce__(self):
             return os.mkdir, (str(trace),)
 
     torch.save({"state_dict": Hostile()}, path)
@@ -24,13 +23,14 @@ def test_loading_runs_no_code(weights_only, tmp_path):
     assert not trace.exists()
 
 
-def full_disk(*_: object) -> None:
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
 def test_files_that_cannot_be_written_are_written_later_in_order(tmp_path, caplog):
-    refuse = [True]
-    io = AtomicCheckpointIO(prepare=lambda: full_disk() if refuse[0] else None)
+    errors = [OSError(errno.ENOSPC, "No space left on device")]
+
+    def prepare():
+        for error in errors:
+            raise error
+
+    io = AtomicCheckpointIO(prepare=prepare)
     with pytest.raises(Exception, match="pickle"):  # a retry would not help
         AtomicCheckpointIO().save_checkpoint({"step": lambda: 0}, tmp_path / "best.ckpt")
     weights = torch.zeros(2)
@@ -43,7 +43,7 @@ def test_files_that_cannot_be_written_are_written_later_in_order(tmp_path, caplo
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(SavingFailedError, match=r"cannot save best.ckpt in .*: No space left"):
         io.finish()
-    refuse[0] = False
+    errors.clear()
     io.finish()
     assert io.waiting == []
     best = io.load_checkpoint(tmp_path / "best.ckpt")
@@ -68,22 +68,19 @@ def test_files_outside_the_run_are_not_removed(tmp_path, caplog):
 
 def test_a_moved_run_refers_to_its_moved_files(tmp_path):
     old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
-    best = {
-        "dirpath": str(old), "monitor": "val/x", "best_model_path": str(old / "best.ckpt"),
-        "kth_best_model_path": "", "last_model_path": "/etc/passwd",
-        "best_k_models": {str(old / "best.ckpt"): torch.tensor(0.5)},
-    }  # fmt: skip
-    state = {"callbacks": {"ModelCheckpoint": best, "other": {"a": 1}}, "epoch": 3}
-    AtomicCheckpointIO().save_checkpoint(state, old / "last.ckpt")
+
+    def state(folder, last):
+        best = {
+            "dirpath": str(folder), "monitor": "val/x", "last_model_path": last,
+            "best_model_path": str(folder / "best.ckpt"), "kth_best_model_path": "",
+            "best_k_models": {str(folder / "best.ckpt"): torch.tensor(0.5)},
+        }  # fmt: skip
+        return {"callbacks": {"ModelCheckpoint": best, "other": {"a": 1}}, "epoch": 3}
+
+    AtomicCheckpointIO().save_checkpoint(state(old, "/etc/passwd"), old / "last.ckpt")
     old.parent.rename(new.parent)
     loaded = AtomicCheckpointIO(folder=new.parent).load_checkpoint(new / "last.ckpt")
-    moved = loaded["callbacks"]["ModelCheckpoint"]
-    assert moved["dirpath"] == str(new)
-    assert moved["best_model_path"] == str(new / "best.ckpt")
-    assert (moved["kth_best_model_path"], moved["last_model_path"]) == ("", str(new / "passwd"))
-    assert list(moved["best_k_models"]) == [str(new / "best.ckpt")]
-    assert moved["monitor"] == "val/x"
-    assert (loaded["callbacks"]["other"], loaded["epoch"]) == ({"a": 1}, 3)
+    assert loaded == state(new, str(new / "passwd"))
 
 
 def test_the_previous_file_is_kept(tmp_path):

@@ -1,16 +1,14 @@
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.optim.lr_scheduler import CosineAnnealingLR, OneCycleLR
 
-from dopepp.data.batch import Batch
 from dopepp.training.system import PoseSystem
 
 
-def one_cycle(optimizer: torch.optim.Optimizer, num_steps: int) -> OneCycleLR:
+def one_cycle(optimizer, num_steps):
     return OneCycleLR(optimizer, max_lr=1e-2, total_steps=num_steps)
 
 
@@ -19,12 +17,10 @@ def test_a_longer_run_has_a_new_schedule(schedule, make_system, make_noise, make
     """An ended schedule continues, without an error and without a rate of zero."""
 
     class Watched(PoseSystem):
-        rates: list[float]
-
-        def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        def on_train_batch_start(self, batch, batch_idx):
             self.rates.append(self.trainer.optimizers[0].param_groups[0]["lr"])
 
-    def run(folder: str, epochs: int, resume: Path | None = None) -> list[float]:
+    def run(folder, epochs, resume=None):
         adam = partial(torch.optim.Adam, lr=1e-2)
         system = make_system(system_class=Watched, make_scheduler=schedule, make_optimizer=adam)
         system.rates = []

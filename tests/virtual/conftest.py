@@ -9,13 +9,10 @@ import trimesh
 from dopepp.geometry.camera import camera_matrix
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Mesh, make_part
-from dopepp.virtual import Ambient, Light, Scene, make_surface
+from dopepp.virtual import Ambient, Factory, Light, Scene, make_surface
+from tests.parts.makers import mesh_of
 
 LAMP = Light((0.2, -0.4, -0.2))
-
-
-def mesh_of(solid: trimesh.Trimesh) -> Mesh:
-    return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
 
 
 @pytest.fixture(scope="session")
@@ -55,6 +52,23 @@ def sheet():
         return Mesh(corners * size / 2, faces, (corners[:, :2] + 1) / 2, texture)
 
     return make
+
+
+def even_light(level, **fields):
+    """Return ambient light of one level from above and below."""
+    return Ambient(above=(level,) * 3, below=(level,) * 3, **fields)
+
+
+def pixel_rays(scene):
+    """Return the rays of every pixel, (height, width, 3)."""
+    v, u = np.mgrid[: scene.size[1], : scene.size[0]]
+    return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(scene.K).T
+
+
+def draw_scenes(parts, preset, seed, count, *options):
+    """Return the first scenes of a factory."""
+    factory = Factory(parts, preset, seed, *options)
+    return [factory.scene(0, index) for index in range(count)]
 
 
 @pytest.fixture(scope="session")

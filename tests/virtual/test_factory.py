@@ -12,7 +12,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Mesh, make_part
-from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Rendered, Sensors, render
+from dopepp.virtual import PRESETS, Distractors, Factory, Sensors, render
 from dopepp.virtual.sensor import capture
 
 DIGEST = """
@@ -24,15 +24,15 @@ print([digest(factory.render(epoch, index)) for epoch, index in {items!r}])
 """
 
 
-def make_factory(seed: int = 7, preset: Preset | None = None) -> Factory:
+def make_factory(seed=7, preset=None):
     return Factory([servoholder(), pivconnector()], preset or PRESETS["quickstart"], seed)
 
 
-def small(name: str) -> Preset:
+def small(name):
     return PRESETS[name].resized(128, 96)
 
 
-def digest(rendered: Rendered) -> str:
+def digest(rendered):
     content = hashlib.sha256()
     for array in (
         rendered.image, rendered.depth, rendered.instances, rendered.visible_fractions,
@@ -61,9 +61,8 @@ def test_same_bytes_in_another_process_and_order(name):
     factory = make_factory(preset=small(name))
     expected = [digest(factory.render(*item)) for item in reversed(items)][::-1]
     script = DIGEST.format(folder=str(Path(__file__).parent), items=items, name=name)
-    result = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == str(expected)
     assert len(set(expected)) == len(items)
 
@@ -79,7 +78,7 @@ def test_the_sensor_processes_the_rendered_image():
     assert np.abs(taken.image.astype(int) - ideal.image).mean() > 0.5
 
 
-def lookalikes(factory: Factory, num_scenes: int = 20) -> tuple[list[float], int]:
+def lookalikes(factory, num_scenes=20):
     """Radii of the negatives that scenes show, and how many other distractors there are."""
     sizes = [float(np.linalg.norm(part.cuboid[:8], axis=1).max()) for part in factory.negatives]
     negative_faces = {len(p.mesh.faces) for p in factory.negatives if p.mesh is not None}
@@ -97,7 +96,7 @@ def lookalikes(factory: Factory, num_scenes: int = 20) -> tuple[list[float], int
     return radii, others
 
 
-def with_distractors(**changes: float) -> Preset:
+def with_distractors(**changes):
     return replace(PRESETS["ycb"], distractors=Distractors((3, 3), **changes))
 
 

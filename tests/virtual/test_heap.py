@@ -9,15 +9,16 @@ import dopepp.core.errors
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, transform
 from dopepp.virtual import Factory, heap, visible_fractions
-from dopepp.virtual.presets import Preset, preset_of
+from dopepp.virtual.presets import preset_of
 from dopepp.virtual.presets.table import Pile
 from dopepp.virtual.renderers import find_renderer
+from tests.virtual.conftest import draw_scenes
 
 BOX = np.array([0.10, 0.06, 0.02])  # sides of ``box_part``
 DIAMETER = float(np.linalg.norm(BOX))
 
 
-def small(**changes: object) -> Preset:
+def small(**changes):
     fewer = {"targets_per_image": [5, 9], "distractors": {"number": [0, 0]}}
     return preset_of("heap", {**fewer, **changes}).resized(160, 120)
 
@@ -34,8 +35,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def heaps(box_part):
-    factory = Factory([box_part], small(), 1)
-    return [factory.scene(0, index) for index in range(6)]
+    return draw_scenes([box_part], small(), 1, 6)
 
 
 def in_table_frame(scene):
@@ -80,10 +80,8 @@ def test_no_object_floats(heaps):
             others = [other for other in poses if other is not pose]
             # A box a little lower would enter the box or the wall that carries it.
             lowered = make_transform(pose[:3, :3], pose[:3, 3] - [0.0, 0.0, 0.03 * DIAMETER])
-            carried = any(
-                max(depth_inside(lowered, other), depth_inside(other, lowered)) > 0
-                for other in others
-            )
+            depths = [(depth_inside(lowered, o), depth_inside(o, lowered)) for o in others]
+            carried = np.max(depths) > 0
             leans = len(scene.objects) > len(poses)  # on the bin, which is not a box
             assert on_floor or carried or leans
     highest = [max(pose[2, 3] for pose in in_table_frame(scene)) for scene in heaps]
@@ -137,14 +135,10 @@ def test_images_share_a_heap_and_differ_in_view(box_part):
     for scene in scenes[1:]:
         np.testing.assert_allclose(relative(scene), relative(scenes[0]), atol=1e-9)
         assert np.abs(scene.objects[0].T_cam_obj - scenes[0].objects[0].T_cam_obj).max() > 0.01
-    other = factory.scene(0, 1)
-    assert len(other.objects) != len(scenes[0].objects) or (
-        np.abs(relative(other) - relative(scenes[0])).max() > 0.01
-    )
-    pile = Pile(piles=7)
-    assert {pile.number(i) for i in range(10_000)}.isdisjoint(
-        {pile.number(10**9 + i) for i in range(99)}
-    )
+    first, other = relative(scenes[0]), relative(factory.scene(0, 1))
+    assert len(other) != len(first) or np.abs(other - first).max() > 0.01
+    low, high = ({Pile(piles=7).number(i + shift) for i in range(10_000)} for shift in (0, 10**9))
+    assert low.isdisjoint(high)
 
 
 def test_several_kinds_and_distractors_are_dropped(sized_box):
@@ -160,10 +154,7 @@ def test_several_kinds_and_distractors_are_dropped(sized_box):
 
 
 def test_a_window_shows_a_heap_and_labels_only_parts_in_view(box_part):
-    preset = replace(small(), window=(64, 64))
-    factory = Factory([box_part], preset, 1)
-    for index in range(6):
-        scene = factory.scene(0, index)
+    for scene in draw_scenes([box_part], replace(small(), window=(64, 64)), 1, 6):
         assert scene.targets
         inside = np.array([item.is_target for item in scene.objects])
         assert not visible_fractions(scene)[~inside].any() or (~inside).sum() <= 1  # the bin
@@ -171,9 +162,9 @@ def test_a_window_shows_a_heap_and_labels_only_parts_in_view(box_part):
 
 def test_a_window_omits_only_objects_that_are_far_beside_it(box_part, monkeypatch):
     view = replace(small(targets_per_image=[25, 25]).resized(640, 480), window=(64, 64))
-    some = [Factory([box_part], view, 3).scene(0, index).objects for index in range(4)]
+    some = [scene.objects for scene in draw_scenes([box_part], view, 3, 4)]
     monkeypatch.setattr(heap, "_BESIDE", np.inf)
-    scenes = [Factory([box_part], view, 3).scene(0, index) for index in range(4)]
+    scenes = draw_scenes([box_part], view, 3, 4)
     assert sum(map(len, some)) < sum(len(scene.objects) for scene in scenes)
     for kept, scene in zip(some, scenes, strict=True):
         poses = {item.T_cam_obj.tobytes() for item in kept}
@@ -188,9 +179,8 @@ def test_a_heap_that_reaches_the_camera_is_shown_without_its_top(box_part):
     # The camera is 12 cm above the table, the heap of 30 boxes in a narrow bin is higher.
     table = {"pile": {"bin_share": 1.0, "room": [0.5, 0.6]}, "distance": [0.12, 0.12]}
     table["elevation_deg"] = [89.0, 90.0]
-    factory = Factory([box_part], small(targets_per_image=[30, 30], table=table), 3)
-    for index in range(3):
-        targets = in_table_frame(factory.scene(0, index))
+    for scene in draw_scenes([box_part], small(targets_per_image=[30, 30], table=table), 3, 3):
+        targets = in_table_frame(scene)
         assert 0 < len(targets) < 30
         assert max(pose[2, 3] for pose in targets) < 0.12
 

@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from pathlib import Path
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from dopepp.virtual.backgrounds import (
 SPLITS = ("train", "val", "test")
 
 
-def write_numbers(folder: Path, numbers: range) -> PhotoBackgrounds:
+def write_numbers(folder, numbers):
     """Write files that differ; the division does not decode them."""
     folder.mkdir(exist_ok=True)
     for number in numbers:
@@ -27,7 +27,7 @@ def write_numbers(folder: Path, numbers: range) -> PhotoBackgrounds:
     return PhotoBackgrounds(folder)
 
 
-def contents(photos: PhotoBackgrounds) -> list[list[bytes]]:
+def contents(photos):
     return [sorted(path.read_bytes() for path in photos.part(split).paths) for split in SPLITS]
 
 
@@ -38,9 +38,7 @@ def test_splits_are_disjoint_and_complete(tmp_path, count, expected):
     photos = write_numbers(tmp_path, range(count))
     splits = contents(photos)
     assert [len(split) for split in splits] == expected
-    assert sorted(content for split in splits for content in split) == sorted(
-        path.read_bytes() for path in photos.paths
-    )
+    assert sorted(chain(*splits)) == sorted(path.read_bytes() for path in photos.paths)
     assert all(photos.part(split).is_divided for split in SPLITS)
     assert photos.part("all") is photos
     assert not photos.is_divided

@@ -9,7 +9,7 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.virtual import Factory, Scene, SceneObject
+from dopepp.virtual import Factory
 from dopepp.virtual.factory import approach
 from dopepp.virtual.presets import preset_of
 from dopepp.virtual.scene import NEAR
@@ -21,10 +21,10 @@ SCALES = (0.5, 1.7)
 class Waves:
     """An image so smooth that resampling it hardly changes a colour."""
 
-    def identity(self) -> list[str]:
+    def identity(self):
         return ["waves"]
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    def draw(self, rng, width, height):
         y, x = np.mgrid[:height, :width] / width
         channels = [np.sin(2 * x + 3 * y), np.cos(3 * x), np.sin(2 * y + rng.random())]
         return (127 + 120 * np.stack(channels, axis=-1)).astype(np.uint8)
@@ -38,15 +38,15 @@ PRESETS = {
 
 
 @cache
-def factory(name: str) -> Factory:
+def factory(name):
     return Factory([servoholder(), pivconnector()], PRESETS[name], 1, Waves())
 
 
-def scenes(name: str, scale: float) -> list[Scene]:
+def scenes(name, scale):
     return [factory(name).scene(0, index, scale) for index in range(NUM_SCENES)]
 
 
-def centre(item: SceneObject) -> np.ndarray:
+def centre(item):
     return np.asarray(item.T_cam_obj @ [*item.part.cuboid[CENTROID], 1])[:3]
 
 
@@ -66,11 +66,11 @@ def test_a_scale_divides_the_distance_and_keeps_the_pixel(scale):
 @pytest.mark.parametrize("scale", SCALES)
 def test_only_the_camera_moves(name, scale):
     for scene, near in zip(scenes(name, 1), scenes(name, scale), strict=True):
-        middles = [
-            np.mean([centre(o.objects[i]) for i in o.targets], axis=0) for o in (scene, near)
-        ]
-        np.testing.assert_allclose(middles[1], middles[0] / scale)
-        shift = middles[1] - middles[0]
+        first, second = (
+            np.mean([centre(s.objects[i]) for i in s.targets], axis=0) for s in (scene, near)
+        )
+        np.testing.assert_allclose(second, first / scale)
+        shift = second - first
         depths = [transform(item.T_cam_obj, item.surface.hull)[:, 2] for item in scene.objects]
         kept = [item for item, z in zip(scene.objects, depths, strict=True)
                 if (z + shift[2]).min() > NEAR]  # fmt: skip

@@ -12,7 +12,6 @@ from dopepp.parts.mesh.read import ycb_part
 from dopepp.virtual import Material, Scene, SceneObject, make_surface, render
 
 CLASSES = {2: "003_cracker_box", 4: "005_tomato_soup_can", 5: "006_mustard_bottle"}
-Frame = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +21,7 @@ def frame(ycb_root):
     return {
         "label": cv2.imread(f"{stem}-label.png", cv2.IMREAD_UNCHANGED),
         "depth": cv2.imread(f"{stem}-depth.png", cv2.IMREAD_UNCHANGED)
-        / float(meta["factor_depth"].item()),
+        / meta["factor_depth"].item(),
         "colour": cv2.cvtColor(cv2.imread(f"{stem}-color.png"), cv2.COLOR_BGR2RGB),
         "K": meta["intrinsic_matrix"].astype(np.float64),
         "poses": meta["poses"].astype(np.float64),
@@ -36,12 +35,9 @@ def rendered(ycb_root, frame, quick_sky):
     for class_index, name in CLASSES.items():
         part = ycb_part(ycb_root, name)
         pose = frame["poses"][..., frame["classes"].tolist().index(class_index)]
-        objects.append(
-            SceneObject(
-                make_surface(part.mesh), make_transform(pose[:, :3], pose[:, 3]),
-                Material((1.0, 1.0, 1.0), 0.8), part,
-            )
-        )  # fmt: skip
+        T = make_transform(pose[:, :3], pose[:, 3])
+        white = Material((1.0, 1.0, 1.0), 0.8)
+        objects.append(SceneObject(make_surface(part.mesh), T, white, part))
     return render(Scene(frame["K"], np.zeros_like(frame["colour"]), tuple(objects)))
 
 

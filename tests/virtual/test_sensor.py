@@ -1,6 +1,7 @@
 """The sensor: each step against SciPy, Pillow or a closed form."""
 
 import io
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,15 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dopepp.virtual.sensor import (
-    Sensor,
-    Sensors,
-    add_noise,
-    capture,
-    compress,
-    defocus,
-    motion_blur,
-)
+from dopepp.virtual import sensor as steps
+from dopepp.virtual.sensor import Sensor, Sensors, add_noise, capture
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +48,7 @@ def test_capture_is_pure_and_keeps_the_shape(
     assert (first.dtype, first.shape) == (np.uint8, image.shape)
 
 
-def linear(codes: np.ndarray) -> np.ndarray:
+def linear(codes):
     share = codes / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
@@ -71,22 +65,18 @@ def test_exposure_multiplies_the_light(exposure):
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5])
 def test_defocus_equals_scipys_gaussian(image, sigma):
-    expected = scipy.ndimage.gaussian_filter(
-        image.astype(float), (sigma, sigma, 0), mode="mirror", truncate=4
-    )
-    assert np.abs(defocus(image, sigma) - expected).max() < 2.5
-    assert np.abs(defocus(image, sigma) - expected).mean() < 0.4
+    spread = {"sigma": (sigma, sigma, 0), "mode": "mirror", "truncate": 4}
+    expected = scipy.ndimage.gaussian_filter(image.astype(float), **spread)
+    error = np.abs(steps.defocus(image, sigma) - expected)
+    assert error.max() < 2.5
+    assert error.mean() < 0.4
 
 
 @pytest.mark.parametrize("motion", [(7.0, 0.0), (0.0, -4.5), (3.0, 2.0), (0.3, 0.1), (-6.0, 9.0)])
 def test_motion_blur_is_the_mean_of_shifted_images(image, motion):
-    shifts = [
-        scipy.ndimage.shift(image.astype(float), (t * motion[1], t * motion[0], 0), order=1,
-                            mode="mirror")
-        for t in np.linspace(-0.5, 0.5, 401)
-    ]  # fmt: skip
-    blurred = motion_blur(image, motion)
-    assert np.abs(blurred - np.mean(shifts, axis=0)).max() < 2.0
+    shift = partial(scipy.ndimage.shift, image.astype(float), order=1, mode="mirror")
+    shifts = [shift((t * motion[1], t * motion[0], 0)) for t in np.linspace(-0.5, 0.5, 401)]
+    assert np.abs(steps.motion_blur(image, motion) - np.mean(shifts, axis=0)).max() < 2.0
 
 
 @pytest.mark.parametrize(("level", "read", "shot"), [(128, 6, 0), (40, 0, 8), (200, 3, 5)])
@@ -119,7 +109,7 @@ def test_jpeg_equals_pillows(image):
         Image.fromarray(image).save(stream, "jpeg", quality=quality, subsampling=2)
         stream.seek(0)
         theirs = np.asarray(Image.open(stream)).astype(int)
-        ours = compress(image, quality).astype(int)
+        ours = steps.compress(image, quality).astype(int)
         assert np.abs(ours - theirs).mean() < 1.0
         assert np.abs(ours - image).mean() > 0.3
 
@@ -140,7 +130,7 @@ def test_drawn_sensors_keep_to_their_ranges():
 
 
 def test_probabilities_of_zero_give_the_default_sensor():
-    steps = ("exposure", "blur", "motion", "noise", "jpeg")
-    off = Sensors(**{f"{step}_probability": 0 for step in steps})
+    names = ("exposure", "blur", "motion", "noise", "jpeg")
+    off = Sensors(**{f"{name}_probability": 0 for name in names})
     drawn = off.draw(np.random.default_rng(1))
     assert drawn == Sensor(noise_seed=drawn.noise_seed)

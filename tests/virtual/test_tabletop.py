@@ -10,9 +10,10 @@ import trimesh
 from dopepp.geometry.camera import transform
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import make_part
-from dopepp.virtual import Distractors, Factory, Scene, SceneObject
-from dopepp.virtual.presets import PRESETS, Preset, preset_of
+from dopepp.virtual import Distractors, Factory
+from dopepp.virtual.presets import PRESETS, preset_of
 from dopepp.virtual.tabletop import HeightMap
+from tests.virtual.conftest import draw_scenes
 
 NUM_SCENES = 25
 CONTACT = 1e-4
@@ -21,24 +22,24 @@ CONTACT = 1e-4
 class Constant:
     """Backgrounds of one grey level after another."""
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    def draw(self, rng, width, height):
         return np.full((height, width, 3), rng.integers(1, 255), np.uint8)
 
 
 class Ramp:
     """An image whose red is its column and whose green is its row, over 256 px."""
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    def draw(self, rng, width, height):
         ramp = np.zeros((height, width, 3), np.uint8)
         ramp[..., 0], ramp[..., 1] = np.arange(width), np.arange(height)[:, None]
         return ramp
 
 
-def small(name: str, **changes: object) -> Preset:
+def small(name, **changes):
     return preset_of(name, changes).resized(160, 120)
 
 
-def heights(scene: Scene, item: SceneObject) -> np.ndarray:
+def heights(scene, item):
     """Heights of an object's vertices above the plane, metres."""
     points = transform(item.T_cam_obj, item.surface.vertices)
     return np.asarray(points @ np.array(scene.plane.normal) - scene.plane.offset)
@@ -46,14 +47,12 @@ def heights(scene: Scene, item: SceneObject) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def tables(parts):
-    factory = Factory(parts, small("table"), 1, Constant())
-    return [factory.scene(0, index) for index in range(NUM_SCENES)]
+    return draw_scenes(parts, small("table"), 1, NUM_SCENES, Constant())
 
 
 @pytest.fixture(scope="module")
 def heaps(parts):
-    factory = Factory(parts, small("bin"), 1, Constant())
-    return [factory.scene(0, index) for index in range(NUM_SCENES)]
+    return draw_scenes(parts, small("bin"), 1, NUM_SCENES, Constant())
 
 
 def test_objects_on_a_table_touch_the_plane(tables):
@@ -65,10 +64,11 @@ def test_objects_on_a_table_touch_the_plane(tables):
 
 
 def test_objects_rest_on_a_face_or_lean_on_an_edge(parts):
-    factory = Factory(parts, small("table", table={"tilted_share": 0.0}), 1, Constant())
-    leaning = Factory(parts, small("table", table={"tilted_share": 1.0}), 1, Constant())
-    for index in range(8):
-        scene, other = factory.scene(0, index), leaning.scene(0, index)
+    lying, leaning = (
+        draw_scenes(parts, small("table", table={"tilted_share": share}), 1, 8, Constant())
+        for share in (0.0, 1.0)
+    )
+    for scene, other in zip(lying, leaning, strict=True):
         for item in scene.objects:
             assert (heights(scene, item) < 1e-5).sum() >= 3
         low = [heights(other, other.objects[i]) for i in other.targets]
@@ -86,7 +86,7 @@ def test_heaps_stand_on_the_plane(heaps):
     assert max(counts) >= 8
 
 
-def solid(item: SceneObject) -> manifold3d.Manifold:
+def solid(item):
     vertices = transform(item.T_cam_obj, item.surface.vertices)
     merged, index = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
     mesh = manifold3d.Mesh64(merged, index.reshape(-1)[item.surface.faces].astype(np.uint64))
@@ -124,9 +124,7 @@ def test_camera_poses_are_within_their_ranges(tables):
 def test_the_background_image_lies_on_the_plane(parts):
     wide = {"picture_width": (8.0, 8.0), "elevation_deg": (45.0, 85.0)}
     preset = replace(preset_of("table", {"table": wide}), width=256, height=256)
-    factory = Factory(parts, preset, 4, Ramp())
-    for index in range(4):
-        scene = factory.scene(0, index)
+    for scene in draw_scenes(parts, preset, 4, 4, Ramp()):
         normal = np.array(scene.plane.normal)
         v, u = np.mgrid[10:250:7, 10:250:7].reshape(2, -1)
         rays = np.stack([u, v, np.ones(u.shape)], axis=1) @ np.linalg.inv(scene.K).T
@@ -155,9 +153,8 @@ def test_another_image_is_shown_beyond_the_horizon(parts):
 
 def test_an_image_without_targets_has_its_distractors(parts):
     for name in ("table", "bin", "paper", "quickstart", "ycb"):
-        preset = replace(
-            PRESETS[name].resized(96, 72), targets_per_image=(0, 0), distractors=Distractors((3, 3))
-        )
+        changes = {"targets_per_image": (0, 0), "distractors": Distractors((3, 3))}
+        preset = replace(PRESETS[name].resized(96, 72), **changes)
         factory = Factory(parts, preset, 0)
         scenes = [factory.scene(0, index) for index in range(2)]
         assert all(scene.targets == () for scene in scenes)
@@ -167,16 +164,11 @@ def test_an_image_without_targets_has_its_distractors(parts):
 
 
 @pytest.mark.parametrize("name", ["table", "bin"])
-def test_parts_from_files_lie_on_the_table(name, request):
-    shared = request.getfixturevalue("shared_data")
-    path = sorted((shared / "parts" / "so_arm100").glob("*.stl"))[0]
-    theirs = [
-        make_part("printed", read_mesh(path, "mm")),
-        ycb_part(shared / "ycb_video_mini", "006_mustard_bottle"),
-    ]
-    factory = Factory(theirs, small(name), 0, Constant())
-    for index in range(4):
-        scene = factory.scene(0, index)
+def test_parts_from_files_lie_on_the_table(name, shared_data, ycb_root):
+    path = min((shared_data / "parts" / "so_arm100").glob("*.stl"))
+    printed = make_part("printed", read_mesh(path, "mm"))
+    theirs = [printed, ycb_part(ycb_root, "006_mustard_bottle")]
+    for scene in draw_scenes(theirs, small(name), 0, 4, Constant()):
         assert scene.targets
         lowest = [heights(scene, item).min() for item in scene.objects]
         assert min(lowest) >= -1e-9

@@ -1,10 +1,5 @@
 """Images and cameras of ROS recordings that ``rosbags`` wrote."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +8,8 @@ from dopepp.core.errors import UserError
 from dopepp.inference.frames import open_sources
 
 pytest.importorskip("rosbags")
+from functools import partial
+
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -25,25 +22,23 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 class Recording:
     """Messages of ROS 1 or 2 on topics, written to a file or folder."""
 
-    def __init__(self, kind: str, folder: Path) -> None:
+    def __init__(self, kind, folder):
         self._is_ros1 = kind == "bag"
         self.path = folder / {"bag": "run.bag"}.get(kind, "run")
         self._store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
         plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        self._writer: Any = (
-            rosbag1.Writer(self.path) if self._is_ros1
-            else rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
-        )  # fmt: skip
-        self._topics: dict[str, Any] = {}
+        ros2 = partial(rosbag2.Writer, version=9, storage_plugin=plugin)
+        self._writer = (rosbag1.Writer if self._is_ros1 else ros2)(self.path)
+        self._topics = {}
 
-    def __enter__(self) -> Recording:
+    def __enter__(self):
         self._writer.open()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._writer.close()
 
-    def write(self, topic: str, kind: str, second: int, **fields: Any) -> None:
+    def write(self, topic, kind, second, **fields):
         name, types = f"sensor_msgs/msg/{kind}", self._store.types
         stamp = types["builtin_interfaces/msg/Time"](second, 500_000_000)
         counted = {"seq": second} if self._is_ros1 else {}
@@ -54,14 +49,14 @@ class Recording:
         encode = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         self._writer.write(self._topics[topic], second * 10**9, encode(message, name))
 
-    def image(self, topic: str, encoding: str, data: np.ndarray, second: int = 1) -> None:
+    def image(self, topic, encoding, data, second=1):
         rows = np.pad(data.reshape(len(data), -1), ((0, 0), (0, 3)))  # rows may be padded
         self.write(
             topic, "Image", second, height=data.shape[0], width=data.shape[1], encoding=encoding,
             is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
         )  # fmt: skip
 
-    def camera(self, topic: str, **changes: Any) -> None:
+    def camera(self, topic, **changes):
         large = {"k": K, "d": LENS, "p": P, "r": np.eye(3).ravel().tolist()}
         names = {name: name.upper() if self._is_ros1 else name for name in large}
         roi = self._store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
@@ -78,9 +73,8 @@ def test_recording_has_images_times_and_camera(kind, tmp_path):
         bag.camera("/other/camera_info", width=640)
         for second in (1, 2, 3):
             bag.image("/cam/image_raw", "bgr8", IMAGE[..., ::-1] // second, second)
-    paths = [bag.path] if kind == "bag" else [bag.path, next(bag.path.glob("run*.*3")
-             if kind == "sqlite3" else bag.path.glob("*.mcap"))]  # fmt: skip
-    for path in paths:
+    inside = {"bag": [], "mcap": bag.path.glob("*.mcap"), "sqlite3": bag.path.glob("run*.*3")}[kind]
+    for path in (bag.path, *inside):
         (source,) = open_sources([path])
         frames = list(source.frames())
         assert [frame.time for frame in frames] == [1.5, 2.5, 3.5]
@@ -101,9 +95,8 @@ def test_every_encoding_is_converted_to_rgb(encoding, tmp_path):
     with Recording("mcap", tmp_path) as bag:
         if encoding in ("png", "jpeg"):
             coded = cv2.imencode(f".{encoding}", smooth[..., ::-1])[1].ravel()
-            bag.write(
-                "/cam/image_raw/compressed", "CompressedImage", 1, format=encoding, data=coded
-            )
+            topic, fields = "/cam/image_raw/compressed", {"format": encoding, "data": coded}
+            bag.write(topic, "CompressedImage", 1, **fields)
             bag.camera("/cam/camera_info")
             tolerance = 0.0 if encoding == "png" else 6.0
         else:
@@ -115,25 +108,23 @@ def test_every_encoding_is_converted_to_rgb(encoding, tmp_path):
     assert (source.camera is not None) == (encoding in ("png", "jpeg"))
 
 
-def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def coded_as(encoding, rgb):
     """Return encoded pixels, the expected image, and the tolerated mean error of a decoder."""
-    if encoding == "mono8":
-        grey = rgb[..., 1]
-        return grey[..., None], np.repeat(grey[..., None], 3, 2), 0.0
-    if encoding == "bayer_rggb8":
-        mosaic = rgb[..., 1].copy()
-        mosaic[::2, ::2], mosaic[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
-        return mosaic[..., None], rgb, 12.0
-    if encoding == "yuv422_yuy2":
-        yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV)
-        data = np.stack([yuv[..., 0], yuv[..., 1]], axis=-1)
-        data[:, 1::2, 1] = yuv[:, ::2, 2]
-        return data, rgb, 15.0
-    alpha = np.full((*rgb.shape[:2], 1), 9, np.uint8)
+    green, alpha = rgb[..., 1:2], np.full((*rgb.shape[:2], 1), 9, np.uint8)
+    mosaic = green[..., 0].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
+    yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV)
+    yuyv = yuv[..., :2].copy()
+    yuyv[:, 1::2, 1] = yuv[:, ::2, 2]
     return {
-        "rgb8": rgb, "8UC3": rgb[..., ::-1], "rgba8": np.dstack([rgb, alpha]),
-        "bgra8": np.dstack([rgb[..., ::-1], alpha]),
-    }[encoding], rgb, 0.0  # fmt: skip
+        "rgb8": (rgb, rgb, 0.0),
+        "8UC3": (rgb[..., ::-1], rgb, 0.0),
+        "rgba8": (np.dstack([rgb, alpha]), rgb, 0.0),
+        "bgra8": (np.dstack([rgb[..., ::-1], alpha]), rgb, 0.0),
+        "mono8": (green, np.repeat(green, 3, 2), 0.0),
+        "bayer_rggb8": (mosaic[..., None], rgb, 12.0),
+        "yuv422_yuy2": (yuyv, rgb, 15.0),
+    }[encoding]
 
 
 def test_rectified_images_have_the_camera_of_p(tmp_path):

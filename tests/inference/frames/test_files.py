@@ -1,7 +1,5 @@
 """Frames of images, folders, patterns and videos, and errors about unreadable sources."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,7 @@ from dopepp.core.errors import UserError
 from dopepp.inference.frames import open_sources
 
 
-def grey(level: int, size: tuple[int, int] = (32, 24)) -> np.ndarray:
+def grey(level, size=(32, 24)):
     return np.full((*size[::-1], 3), level, np.uint8)
 
 
@@ -26,16 +24,17 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def clip(tmp_path):
-    path = tmp_path / "clip.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (32, 24))
-    for number in range(12):
-        writer.write(grey(20 * number))
-    writer.release()
-    return path
+def clip(tmp_path, write_clip):
+    return write_clip(tmp_path / "clip.mp4", [grey(20 * number) for number in range(12)], "mp4v")
 
 
-def levels(*given: object, stride: int = 1) -> list[int]:
+def only_frame(path):
+    (source,) = open_sources([path])
+    (frame,) = source.frames()
+    return frame
+
+
+def levels(*given, stride=1):
     frames = [frame for source in open_sources(given) for frame in source.frames(stride)]
     return [round(float(frame.image.mean()) / 20) for frame in frames]
 
@@ -46,10 +45,8 @@ def test_folder_pattern_and_list_of_files_are_one_sequence(folder):
     assert len(open_sources(sorted(folder.glob("*.png")))) == 1
     assert levels(folder, stride=2) == [0, 10]
     (source,) = open_sources([str(folder)])
-    assert [Path(frame.name).name for frame in source.frames()] == [
-        "frame0.png", "frame2.png", "frame10.png",
-    ]  # fmt: skip
-    assert [frame.number for frame in source.frames()] == [0, 1, 2]
+    named = [(frame.number, Path(frame.name).name) for frame in source.frames()]
+    assert named == [(0, "frame0.png"), (1, "frame2.png"), (2, "frame10.png")]
     assert (source.count, source.rate) == (3, None)
 
 
@@ -74,16 +71,10 @@ def test_sources_of_several_kinds_keep_their_order(folder, clip):
     assert levels(folder, clip, folder / "frame2.png") == [0, 2, 10, *range(12), 2]
 
 
-def test_colour_channels_are_rgb(tmp_path):
-    red = np.zeros((24, 32, 3), np.uint8)
-    red[..., 2] = 200
-    writer = cv2.VideoWriter(
-        str(tmp_path / "red.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (32, 24)
+def test_colour_channels_are_rgb(tmp_path, write_clip):
+    frame = only_frame(
+        write_clip(tmp_path / "red.avi", [np.full((24, 32, 3), (200, 0, 0), np.uint8)])
     )
-    writer.write(red)
-    writer.release()
-    (source,) = open_sources([tmp_path / "red.avi"])
-    (frame,) = source.frames()
     assert frame.image[..., 0].mean() > 180 > 30 > frame.image[..., 1:].mean()
 
 
@@ -99,20 +90,16 @@ def test_images_of_any_mode_are_converted_to_rgb(tmp_path, mode):
         image = image.convert(mode)
     path = tmp_path / ("image.tif" if mode in ("CMYK", "I;16") else "image.png")
     image.save(path)
-    (source,) = open_sources([path])
-    (frame,) = source.frames()
+    frame = only_frame(path)
     assert (frame.image.shape, frame.image.dtype) == ((48, 64, 3), np.uint8)
     assert np.abs(frame.image.mean(axis=2) - levels).max() <= 2
 
 
 def test_exif_orientation_is_applied(tmp_path):
-    image = Image.fromarray(grey(0, (64, 48)))
     exif = Image.Exif()
     exif[274] = 6
-    image.save(tmp_path / "turned.jpg", exif=exif)
-    (source,) = open_sources([tmp_path / "turned.jpg"])
-    (frame,) = source.frames()
-    assert frame.image.shape == (64, 48, 3)
+    Image.fromarray(grey(0, (64, 48))).save(tmp_path / "turned.jpg", exif=exif)
+    assert only_frame(tmp_path / "turned.jpg").image.shape == (64, 48, 3)
 
 
 @pytest.mark.parametrize(
@@ -143,12 +130,9 @@ def test_unreadable_sources_are_reported_in_one_line(
     assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg prints a message
 
 
-def test_truncated_video_yields_its_frames(tmp_path, caplog, capfd):
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-    for number in range(12):
-        writer.write(np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8))
-    writer.release()
+def test_truncated_video_yields_its_frames(tmp_path, write_clip, capfd):
+    noise = np.random.default_rng(0).integers(0, 256, (12, 48, 64, 3), np.uint8)
+    path = write_clip(tmp_path / "clip.avi", noise)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     (source,) = open_sources([path])
     assert 0 < len(list(source.frames())) < 12

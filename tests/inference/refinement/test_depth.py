@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from dopepp.geometry.camera import camera_matrix, make_transform, transform
+from dopepp.geometry.camera import camera_matrix, make_transform, move_pose, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.depth.terms import outline_terms, plane_terms
@@ -21,10 +21,11 @@ from dopepp.inference.refinement.part_surface import (
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.inference.refinement.solver import make_prior
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import make_part
 from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers.raster import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
+from tests.parts.makers import mesh_of
 
 K = camera_matrix(600, 600, 319.5, 239.5)
 TILTED = rotation_vector_to_matrix(np.array([2.6, 0.3, 0.2]))
@@ -34,12 +35,11 @@ BLACK = np.zeros((480, 640, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
-def box() -> Part:
-    whole = trimesh.creation.box((0.164, 0.214, 0.072))
-    return make_part("box", Mesh(np.array(whole.vertices), np.array(whole.faces, np.int32)))
+def box():
+    return make_part("box", mesh_of(trimesh.creation.box((0.164, 0.214, 0.072))))
 
 
-def seen(part: Part, T: np.ndarray, wall: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+def seen(part, T, wall=0.9):
     """Return image and noisy depth of a part before a wall."""
     body = make_body(part, is_target=True)
     objects, plane = (SceneObject(body.surface, T, part=part),), Plane((0.0, 0.0, -1.0), -wall)
@@ -49,19 +49,22 @@ def seen(part: Part, T: np.ndarray, wall: float = 0.9) -> tuple[np.ndarray, np.n
     return rendered.image, (depth + 1e-3 * noise * (depth > 0)).astype(np.float32)
 
 
-def depth_of(part: Part, T: np.ndarray) -> np.ndarray:
+def depth_of(part, T):
     return seen(part, T)[1]
 
 
-def started(T: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    shift = rng.normal(size=3) * [0.25, 0.25, 1.0]
+def started(T, rng):
+    shift, axis = rng.normal(size=3) * [0.25, 0.25, 1.0], rng.normal(size=3)
     shift *= 0.014 / np.linalg.norm(shift)
-    axis = rng.normal(size=3)
     axis *= math.radians(4) / np.linalg.norm(axis)
-    return make_transform(rotation_vector_to_matrix(axis) @ T[:3, :3], T[:3, 3] + shift)
+    return move_pose(T, np.concatenate([axis, shift]))
 
 
-def add(part: Part, one: np.ndarray, other: np.ndarray) -> float:
+def moved(T, z=0.0, x=0.0):
+    return move_pose(T, np.array([0, 0, 0, x, 0, z]))
+
+
+def add(part, one, other):
     points = transform(one, part.points) - transform(other, part.points)
     return float(np.linalg.norm(points, axis=1).mean())
 
@@ -82,9 +85,7 @@ def test_finds_the_pose_from_14_mm_away(name, box):
 def test_keeps_the_pose_when_depth_shows_something_else(box):
     start = started(TRUE, np.random.default_rng(0))
     refiner = PartRefiner(box, ["depth"])
-    wall = np.full((480, 640), 0.9, np.float32)
-    nothing = np.zeros_like(wall)
-    near = np.full_like(wall, 0.3)
+    wall, nothing, near = (np.full((480, 640), z, np.float32) for z in (0.9, 0.0, 0.3))
     noise = np.random.default_rng(0).uniform(0.3, 1.5, wall.shape).astype(np.float32)
     for depth in (wall, nothing, near, noise, None):
         kept = refiner.refine(BLACK, K, start, depth=depth)
@@ -95,11 +96,9 @@ def test_keeps_the_pose_when_depth_shows_something_else(box):
 
 def test_keeps_the_pose_that_the_image_is_sure_of():
     """Depth of the same plate 40 mm aside contradicts a pose known to a millimetre."""
-    part, aside = pivconnector(), TRUE.copy()
-    aside[0, 3] += 0.04
-    sure = np.diag([1e-3] * 6) ** 2
-    refiner = PartRefiner(part, ["depth"])
-    kept = refiner.refine(BLACK, K, TRUE, sure, depth_of(part, aside))
+    part, sure = pivconnector(), np.diag([1e-3] * 6) ** 2
+    depth = depth_of(part, moved(TRUE, x=0.04))
+    kept = PartRefiner(part, ["depth"]).refine(BLACK, K, TRUE, sure, depth)
     assert np.linalg.norm(kept.T_cam_obj[:3, 3] - TRUE[:3, 3]) < 0.012
 
 
@@ -119,11 +118,8 @@ def test_a_part_of_few_points_is_kept():
 
 @pytest.mark.parametrize(
     ("picture", "measured", "better"),
-    [
-        (True, True, 0.001),
-        (True, False, 0.008),  # the scale may be off by 1 % of 0.6 m
-        (False, True, 0.003),
-    ],
+    # The scale of an image alone may be off by 1 % of 0.6 m.
+    [(True, True, 0.001), (True, False, 0.008), (False, True, 0.003)],
 )
 def test_picture_and_depth_refine_in_one_and_each_without_the_other(picture, measured, better):
     part = pivconnector()
@@ -131,9 +127,8 @@ def test_picture_and_depth_refine_in_one_and_each_without_the_other(picture, mea
     refiner = PartRefiner(part, ["region", "depth"])
     for seed in range(3):
         start = started(TRUE, np.random.default_rng(seed))
-        refined = refiner.refine(
-            image if picture else BLACK, K, start, depth=depth if measured else None
-        )
+        shown, known = image if picture else BLACK, depth if measured else None
+        refined = refiner.refine(shown, K, start, depth=known)
         assert refined.reason == ""
         assert (refined.agreement is not None) == picture
         assert add(part, refined.T_cam_obj, TRUE) < better
@@ -156,8 +151,7 @@ def test_depth_is_followed_where_the_outline_is_too_large():
 
 def test_planes_pull_by_what_is_measured_on_the_part(box):
     """Of a face that lies 4 mm too far, the step is that, whatever hides it."""
-    off = FACING.copy()
-    off[2, 3] += 0.004
+    off = moved(FACING, z=0.004)
     surface, depth = surface_points(box.points), depth_of(box, FACING)
     hidden, holes = depth.copy(), depth.copy()
     hidden[:, 290:330] = 0.4
@@ -223,24 +217,20 @@ def test_outline_pulls_a_shifted_part_back(box):
     """Seen face on, the pull of the outline is the shift, and nothing where there is none."""
     depth, surface = depth_of(box, FACING), surface_points(box.points)
     for shift in (0.0, 0.006):
-        off = FACING.copy()
-        off[0, 3] += shift
-        points = transform(off, surface.points)
-        view = view_around(depth, K, points)
+        off = moved(FACING, x=shift)
+        view = view_around(depth, K, transform(off, surface.points))
         overlay = overlay_surface(view, surface, visible(surface, off), off)
         H, g = outline_terms(view, overlay, off[:3, 3], surface.spacing, 0.02)
-        moved = np.linalg.solve(H[3:5, 3:5], g[3:5])
-        assert -2 * shift - 0.002 <= moved[0] <= 0.002 - shift / 2
-        assert abs(moved[1]) < 0.002
+        step = np.linalg.solve(H[3:5, 3:5], g[3:5])
+        assert -2 * shift - 0.002 <= step[0] <= 0.002 - shift / 2
+        assert abs(step[1]) < 0.002
 
 
 @settings(max_examples=30)
 @given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
-def test_prior_measures_turns_and_shifts(values):
-    turn, shift = np.array(values[:3]), np.array(values[3:])
+def test_prior_measures_turns_and_shifts(step):
     prior = make_prior(TRUE, 0.1)
-    moved = make_transform(rotation_vector_to_matrix(turn) @ TRUE[:3, :3], TRUE[:3, 3] + shift)
-    assert_allclose(prior.offset(moved), [*-turn, *-shift], atol=1e-9)
+    assert_allclose(prior.offset(move_pose(TRUE, np.array(step))), -np.array(step), atol=1e-9)
     assert np.linalg.eigvalsh(prior.information).min() > 0
     broken = make_prior(TRUE, 0.1, np.full((6, 6), np.nan))  # a covariance that is none
     assert_allclose(broken.information, prior.information)

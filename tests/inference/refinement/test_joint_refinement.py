@@ -1,7 +1,5 @@
 """The joint solver against least squares of SciPy, on keypoints instead of outlines."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -33,36 +31,34 @@ BLANK = np.zeros((4, 4, 3), np.uint8)
 class Keypoints:
     """Points of a part that a camera has measured."""
 
-    def __init__(self, pixels: np.ndarray) -> None:
+    def __init__(self, pixels):
         self.pixels = pixels
 
     def __call__(self, pose, prior):
         def residuals(step):
-            return (
-                (self.pixels - project(transform(move_pose(pose, step), POINTS), K)) / NOISE_PX
-            ).ravel()
+            shown = project(transform(move_pose(pose, step), POINTS), K)
+            return ((self.pixels - shown) / NOISE_PX).ravel()
 
         rest = residuals(np.zeros(6))
         rows = np.column_stack([(rest - residuals(1e-6 * axis)) / 1e-6 for axis in np.eye(6)])
         return rows.T @ rows, rows.T @ rest
 
 
-def scene(seed: int, error: np.ndarray, num_views: int = 2):
+def scene(seed, error, num_views=2):
     """Return the true pose in the world, the views and their measured keypoints."""
     rng = np.random.default_rng(seed)
     true = make_transform(random_rotation(rng), rng.normal(size=3))
     views, pixels = [], []
     for number in range(num_views):
         turn = rotation_vector_to_matrix(np.array([0.1, math.radians(25) * number, 0.0]))
-        T_cam_obj = make_transform(
-            turn @ random_rotation(np.random.default_rng(1)), np.array([0.01, 0.02, 0.3])
-        )
+        R = turn @ random_rotation(np.random.default_rng(1))
+        T_cam_obj = make_transform(R, np.array([0.01, 0.02, 0.3]))
         T_cam_world = T_cam_obj @ invert_transform(true)
         measured = project(transform(T_cam_obj, POINTS), K)
         pixels.append(measured + NOISE_PX * rng.normal(size=measured.shape))
         # The camera is elsewhere than stated: T_cam_world is off by a draw of the error.
         draw = np.linalg.cholesky(error + 1e-30 * np.eye(6)) @ rng.normal(size=6)
-        off = make_transform(rotation_vector_to_matrix(draw[:3]), draw[3:])
+        off = move_pose(np.eye(4), draw)
         views.append(PosedImage(BLANK, K, invert_transform(off) @ T_cam_world, error))
     return true, views, pixels
 
@@ -81,19 +77,14 @@ def by_scipy(true, views, pixels, error):
         pose, rest = move_pose(true, unknowns[:6]), []
         for number, (view, px) in enumerate(zip(views, pixels, strict=True)):
             step = unknowns[6 + 6 * number : 12 + 6 * number]
-            off = make_transform(rotation_vector_to_matrix(step[:3]), step[3:])
-            rest.append(
-                (
-                    (project(transform(off @ view.T_cam_world @ pose, POINTS), K) - px) / NOISE_PX
-                ).ravel()
-            )
-            rest.append(whiten @ step)
+            T_cam_obj = move_pose(np.eye(4), step) @ view.T_cam_world @ pose
+            away = project(transform(T_cam_obj, POINTS), K) - px
+            rest += [(away / NOISE_PX).ravel(), whiten @ step]
         return np.concatenate(rest)
 
     scale = np.concatenate([np.full(3, 1e-3), np.full(3, 1e-4)] * (1 + len(views)))
-    solved = least_squares(
-        residuals, np.zeros(6 + 6 * len(views)), x_scale=scale, xtol=1e-14, ftol=1e-14
-    )
+    start = np.zeros(6 + 6 * len(views))
+    solved = least_squares(residuals, start, x_scale=scale, xtol=1e-14, ftol=1e-14)
     covariance = np.linalg.inv(solved.jac.T @ solved.jac)[:6, :6]
     return move_pose(true, solved.x[:6]), covariance
 
@@ -125,7 +116,6 @@ def test_a_covariance_returns_from_the_world():
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
     T_world_obj, in_world = view.to_world(view.pose(true), covariance)
     assert_allclose(T_world_obj, true, atol=1e-12)
-    assert_allclose(
-        np.linalg.inv(view.to_camera(true, in_world).information), covariance, atol=1e-15
-    )
+    information = view.to_camera(true, in_world).information
+    assert_allclose(np.linalg.inv(information), covariance, atol=1e-15)
     assert_allclose(in_world, rotate_covariance(view.T_cam_world[:3, :3].T, covariance), atol=1e-18)

@@ -7,43 +7,36 @@ import numpy as np
 import pytest
 import trimesh
 
-from dopepp.geometry.camera import (
-    Transform,
-    camera_matrix,
-    make_transform,
-    move_pose,
-    project,
-    transform,
-)
+from dopepp.geometry.camera import camera_matrix, make_transform, move_pose, project, transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.inference.refinement.verification import EVIDENCE, Verifier, learned_model
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import make_part
 from dopepp.recovery.detection import Detection
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import preset_of
+from tests.parts.makers import mesh_of
 
 K = camera_matrix(400, 400, 159.5, 119.5)
 POSE = make_transform(rotation_vector_to_matrix(np.array([2.4, 0.5, 0.4])), np.array([0, 0, 0.35]))
 COVARIANCE = np.diag(np.repeat([math.radians(2.0), 0.002], 3) ** 2)
 
 
-def wedge() -> Part:
+def wedge():
     """A part without symmetries: two boxes and a rod."""
     pieces = [trimesh.creation.box((0.08, 0.05, 0.02)), trimesh.creation.box((0.02, 0.05, 0.06))]
     pieces.append(trimesh.creation.cylinder(0.008, 0.05))
     for piece, shift in zip(pieces, [(0, 0, 0), (0.03, 0, 0.03), (-0.02, 0.01, 0.03)], strict=True):
         piece.apply_translation(shift)
-    mesh = trimesh.util.concatenate(pieces)
-    return make_part("wedge", Mesh(np.asarray(mesh.vertices), mesh.faces.astype(np.int32)))
+    return make_part("wedge", mesh_of(*pieces))
 
 
 PART = wedge()
 
 
 @pytest.fixture(scope="module")
-def rendered() -> tuple[np.ndarray, np.ndarray, Transform]:
+def rendered():
     """Return a render of the part, its camera matrix and its pose."""
     fields = {
         "width": 320, "height": 240, "turning": {"kind": "free"}, "distractors": {"number": [0, 0]},
@@ -55,17 +48,15 @@ def rendered() -> tuple[np.ndarray, np.ndarray, Transform]:
     return picture.image, scene.K, scene.objects[scene.targets[0]].T_cam_obj
 
 
-def evidence(image: np.ndarray, K: np.ndarray, T: Transform, part: Part = PART) -> dict[str, float]:
+def evidence(image, K, T, part=PART):
     """Return the evidence about a pose by name."""
-    assert part.mesh is not None
     verifier = Verifier(make_outline_mesh(part.mesh.vertices, part.mesh.faces), part.diameter)
     values = verifier.evidence(image, K, T, COVARIANCE, 1.0)
-    assert values is not None
     assert np.isfinite(values).all()
     return dict(zip(EVIDENCE, values, strict=True))
 
 
-def drawn_box(shade: tuple[int, int, int]) -> np.ndarray:
+def drawn_box(shade):
     """Return an image of a cube in one colour on black, drawn by ray casting."""
     v, u = np.mgrid[:240, :320].reshape(2, -1)
     rays = np.column_stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)])
@@ -75,9 +66,8 @@ def drawn_box(shade: tuple[int, int, int]) -> np.ndarray:
     return np.where(hits[..., None], np.array(shade, np.uint8), 0).astype(np.uint8)
 
 
-def box_part() -> Part:
-    box = trimesh.creation.box((0.06, 0.06, 0.06))
-    return make_part("box", Mesh(np.asarray(box.vertices), box.faces.astype(np.int32)))
+def box_part():
+    return make_part("box", mesh_of(trimesh.creation.box((0.06, 0.06, 0.06))))
 
 
 def test_a_flat_silhouette_has_an_outline_and_no_creases():
@@ -126,9 +116,7 @@ def test_a_refined_detection_has_its_probability(rendered):
     right = Detection("wedge", 0.6, 0.6, T, pixels, pixels, 1.0, COVARIANCE)
     refiner = Refiner("region", [PART])
     assert refiner.verifies
-    probability = refiner(right, image, K, None).probability
-    assert probability is not None
-    assert probability > 0.5
+    assert refiner(right, image, K, None).probability > 0.5
     noise = np.random.default_rng(0).integers(0, 256, image.shape, np.uint8)
     assert refiner(right, noise, K, None).probability < 0.05
     away = replace(right, T_cam_obj=make_transform(T[:3, :3], np.array([5.0, 0.0, 0.3])))
@@ -136,8 +124,7 @@ def test_a_refined_detection_has_its_probability(rendered):
 
 
 def test_a_part_without_a_mesh_is_not_verified():
-    bare = replace(PART, mesh=None)
-    assert not Refiner("depth", [bare]).verifies
+    assert not Refiner("depth", [replace(PART, mesh=None)]).verifies
 
 
 def test_a_model_of_other_evidence_is_refused(monkeypatch):

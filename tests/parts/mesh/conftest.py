@@ -1,10 +1,8 @@
 import pytest
-import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.parts import read_mesh
-
-Content = str | bytes
+from tests.parts.makers import solid_of
 
 
 @pytest.fixture(scope="session")
@@ -12,7 +10,7 @@ def volume():
     """Return a mesh's volume, after checking that it is a solid that faces outwards."""
 
     def measure(mesh):
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        solid = solid_of(mesh)
         assert solid.is_volume
         return float(solid.volume)
 

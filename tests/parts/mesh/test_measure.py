@@ -26,18 +26,17 @@ BALL = np.random.default_rng(1).normal(size=(2000, 3))
 BALL /= np.linalg.norm(BALL, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        np.zeros((1, 3)),
-        np.full((5, 3), 0.3),
-        np.repeat(np.eye(3), 4, axis=0),
-        np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T.astype(float),
-        np.random.default_rng(0).normal(size=(3000, 3)),
-        BALL,
-    ],
-    ids=["one", "coincident", "duplicates", "cube", "many", "all on the hull"],
-)
+SETS = {
+    "one": np.zeros((1, 3)),
+    "coincident": np.full((5, 3), 0.3),
+    "duplicates": np.repeat(np.eye(3), 4, axis=0),
+    "cube": np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T.astype(float),
+    "many": np.random.default_rng(0).normal(size=(3000, 3)),
+    "all on the hull": BALL,
+}
+
+
+@pytest.mark.parametrize("points", SETS.values(), ids=SETS)
 def test_largest_distance_of_special_sets(points):
     expected = pdist(points).max() if len(points) > 1 else 0.0
     assert largest_distance(points) == pytest.approx(expected, rel=1e-12, abs=1e-15)
@@ -64,7 +63,7 @@ def test_largest_distance_of_rounded_sets_without_all_pairs(shape):
 
 def test_largest_distance_of_one_point_outside_a_plane():
     x, y = np.meshgrid(np.linspace(0, 1, 100), np.linspace(0, 1, 100))
-    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
     points[1] = [0.5, 0.5, 3]
     assert largest_distance(points) == pytest.approx(np.sqrt(9.5), rel=1e-12)
 
@@ -89,9 +88,8 @@ def test_samples_are_uniform_over_the_surface():
     size = np.array([0.1, 0.2, 0.3])
     box = trimesh.creation.box(size)
     top = box.face_normals[:, 2] > 0.9
-    fine = trimesh.util.concatenate(
-        [box.submesh([~top], append=True), box.submesh([top], append=True).subdivide().subdivide()]
-    )
+    lid = box.submesh([top], append=True).subdivide().subdivide()
+    fine = trimesh.util.concatenate([box.submesh([~top], append=True), lid])
     points = sample_surface(np.asarray(fine.vertices), np.asarray(fine.faces), 20_000)
     on_side = np.abs(np.abs(points) - size / 2) < 1e-12
     assert on_side.any(axis=1).all()
@@ -108,7 +106,7 @@ def test_samples_are_uniform_over_the_surface():
 def test_samples_depend_on_the_seed_only():
     mesh = trimesh.creation.box((1, 1, 1))
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    first, again = sample_surface(vertices, faces), sample_surface(vertices, faces)
+    first, again = (sample_surface(vertices, faces) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert (sample_surface(vertices, faces, seed=1) != first).any()
 
@@ -137,9 +135,8 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", SHAPES)
-def test_distances_agree_with_all_triangles(name):
-    mesh = SHAPES[name]
+@pytest.mark.parametrize("mesh", SHAPES.values(), ids=SHAPES)
+def test_distances_agree_with_all_triangles(mesh):
     surface = SurfaceTree(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (500, 3)) * mesh.extents
     _, expected, _ = trimesh.proximity.closest_point_naive(mesh, points)

@@ -9,23 +9,24 @@ from trimesh.exchange.stl import export_stl
 
 from dopepp.parts import read_mesh, servoholder
 from dopepp.parts.mesh import weld
-from dopepp.parts.mesh.read import Topology, find_topology, flip_faces, misoriented_faces
+from dopepp.parts.mesh.read import find_topology, flip_faces, misoriented_faces
 
 
-def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+def arrays(*meshes):
+    mesh = trimesh.util.concatenate(meshes)
     return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
 
 
-def topology_of(vertices: np.ndarray, faces: np.ndarray) -> Topology:
+def topology_of(vertices, faces):
     return find_topology(weld(vertices, faces)[1])
 
 
-def repaired(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def repaired(vertices, faces):
     topology = topology_of(vertices, faces)
     return flip_faces(faces, misoriented_faces(vertices, faces, topology))
 
 
-def cyclic(faces: np.ndarray) -> set[tuple[int, ...]]:
+def cyclic(faces):
     """Triangles by their corners and direction, wherever they start."""
     return {tuple(np.roll(face, -int(face.argmin())).tolist()) for face in faces}
 
@@ -36,10 +37,10 @@ def test_edges_agree_with_trimesh():
     assert topology_of(vertices, faces).is_closed
     cut = faces[np.random.default_rng(0).random(len(faces)) < 0.9]
     topology = topology_of(vertices, cut)
-    open_edges = trimesh.Trimesh(vertices, cut, process=False)
-    unique = trimesh.grouping.group_rows(open_edges.edges_sorted, require_count=1)
-    assert topology.num_open == len(unique) > 0
-    assert topology.num_crowded == 0
+    edges = trimesh.Trimesh(vertices, cut, process=False).edges_sorted
+    unique = trimesh.grouping.group_rows(edges, require_count=1)
+    assert (topology.num_open, topology.num_crowded) == (len(unique), 0)
+    assert len(unique) > 0
     tip = np.vstack([vertices, [[9.0, 9.0, 9.0]]])
     fin = np.vstack([faces, [[faces[0, 0], faces[0, 1], len(vertices)]]])
     assert (topology_of(tip, fin).num_crowded, topology_of(tip, fin).num_open) == (1, 2)
@@ -70,8 +71,7 @@ def test_an_open_surface_follows_its_majority():
 def test_every_body_is_repaired_by_itself_and_a_cavity_stays():
     outer, inner = trimesh.creation.icosphere(2, 1.0), trimesh.creation.icosphere(2, 0.5)
     inner.invert()
-    hollow = trimesh.util.concatenate([outer, inner])
-    vertices, faces = arrays(hollow)
+    vertices, faces = arrays(outer, inner)
     np.testing.assert_array_equal(repaired(vertices, faces), faces)
     mixed = flip_faces(faces, np.arange(len(faces)) % 7 == 0)
     assert cyclic(repaired(vertices, mixed)) == cyclic(faces)
@@ -81,7 +81,7 @@ def test_one_body_of_several_that_faces_inwards_is_flipped():
     ball = trimesh.creation.icosphere(2, 1.0)
     beside = trimesh.creation.box((0.5, 0.5, 0.5))
     beside.apply_translation((2, 0, 0))
-    vertices, faces = arrays(trimesh.util.concatenate([ball, beside]))
+    vertices, faces = arrays(ball, beside)
     wrong = flip_faces(faces, np.arange(len(faces)) >= len(ball.faces))
     assert cyclic(repaired(vertices, wrong)) == cyclic(faces)
     assert cyclic(repaired(vertices, faces)) == cyclic(faces)
@@ -91,50 +91,50 @@ def test_a_moebius_strip_is_unchanged():
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rims = []
     for side in (-0.2, 0.2):
-        radius = 1 + side * np.cos(around / 2)
-        height = side * np.sin(around / 2)
+        radius, height = 1 + side * np.cos(around / 2), side * np.sin(around / 2)
         rims.append(np.stack([radius * np.cos(around), radius * np.sin(around), height], axis=1))
-    vertices = np.concatenate(rims)
-    faces = []
-    for i in range(24):
-        a, b = i, i + 24
-        c, d = ((i + 1) % 24, (i + 1) % 24 + 24) if i < 23 else (24, 0)
-        faces += [[a, b, c], [b, d, c]]
-    strip = np.array(faces)
+    vertices, i = np.concatenate(rims), np.arange(24)
+    c, d = np.append(i[1:], 24), np.append(i[1:] + 24, 0)  # the ends are joined upside down
+    strip = np.concatenate([np.c_[i, i + 24, c], np.c_[i + 24, d, c]])
     assert topology_of(vertices, strip).opposed.any()
     np.testing.assert_array_equal(repaired(vertices, strip), strip)
 
 
+@pytest.fixture
+def read(write, caplog):
+    """Return what is read from an STL file of meshes, its path, and the log."""
+
+    def read(*meshes):
+        path = write("a.stl", export_stl(trimesh.util.concatenate(meshes)))
+        with caplog.at_level(logging.INFO):
+            return read_mesh(path, "mm"), path, caplog.records
+
+    return read
+
+
 @pytest.mark.parametrize("share", [0.1, 1.0])
-def test_a_file_that_faces_the_wrong_way_is_repaired(tmp_path, share, caplog, volume):
+def test_a_file_that_faces_the_wrong_way_is_repaired(read, share, volume):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
     ball.faces = flip_faces(ball.faces, np.random.default_rng(0).random(len(ball.faces)) < share)
-    (tmp_path / "a.stl").write_bytes(export_stl(ball))
-    with caplog.at_level(logging.INFO):
-        loaded = read_mesh(tmp_path / "a.stl", "mm")
-    assert [r.levelname for r in caplog.records] == ["INFO"]
-    assert caplog.records[0].message.startswith(f"{tmp_path / 'a.stl'}: flipped")
+    loaded, path, (record,) = read(ball)
+    assert record.levelname == "INFO"
+    assert record.message.startswith(f"{path}: flipped")
     assert volume(loaded) > 0
 
 
-def test_holes_are_counted_in_one_line(tmp_path, caplog):
+def test_holes_are_counted_in_one_line(read):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
     ball.update_faces(np.arange(len(ball.faces)) >= 1)
-    (tmp_path / "a.stl").write_bytes(export_stl(ball))
-    with caplog.at_level(logging.INFO):
-        loaded = read_mesh(tmp_path / "a.stl", "mm")
-    (message,) = caplog.messages
-    assert message.startswith(f"{tmp_path / 'a.stl'} is not watertight")
-    assert "3 open edges" in message
+    loaded, path, (record,) = read(ball)
+    assert record.message.startswith(f"{path} is not watertight")
+    assert "3 open edges" in record.message
     assert len(loaded.faces) == 319
 
 
-def test_intersecting_bodies_are_accepted(tmp_path, caplog):
+def test_intersecting_bodies_are_accepted(read):
     boxes = [trimesh.creation.box((20, 20, 20)), trimesh.creation.box((10, 10, 40))]
-    (tmp_path / "a.stl").write_bytes(export_stl(trimesh.util.concatenate(boxes)))
-    with caplog.at_level(logging.INFO):
-        loaded = read_mesh(tmp_path / "a.stl", "mm")
-    assert not caplog.records
+    loaded, _, records = read(*boxes)
+    assert not records
     np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.02, 0.02, 0.04])
 
 

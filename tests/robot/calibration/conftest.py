@@ -1,6 +1,5 @@
 """A simulated robot with a camera and a board, and the data that it reports."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import BoardDetection, parse_board
+from dopepp.robot.calibration.board import BoardDetection, board_pose, parse_board
 
 
 @dataclass
@@ -23,8 +22,13 @@ class Cell:
     T_base_flange: np.ndarray
     detections: list[BoardDetection]
 
+    @property
+    def boards(self):
+        """Poses of the board in the camera's images."""
+        return [board_pose(detection, self.camera) for detection in self.detections]
 
-def look_at(eye: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
+
+def look_at(eye, target, roll):
     """Return T_world_cam of a camera with a point on its optical axis."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.3, 1.0, 0.1])
@@ -33,9 +37,15 @@ def look_at(eye: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
     return make_transform(R @ Rotation.from_rotvec([0, 0, roll]).as_matrix(), eye)
 
 
-def make_cell(
-    seed: int = 0, num: int = 20, mount: str = "hand", noise: float = 1.0, tilt: float = 0.25
-) -> Cell:
+def take(board, T_cam_board, camera, name, noise_px=0.0, rng=None):
+    """Return the detection of a board in a camera's image."""
+    rotation, shift = cv2.Rodrigues(T_cam_board[:3, :3])[0], T_cam_board[:3, 3]
+    pixels = cv2.projectPoints(board.points, rotation, shift, camera.K, camera.coefficients)[0]
+    noise = noise_px * rng.normal(size=(len(board.points), 2)) if noise_px else 0.0
+    return BoardDetection(name, board.points, pixels[:, 0] + noise)
+
+
+def make_cell(seed=0, num=20, mount="hand", noise=1.0, tilt=0.25):
     """Draw a calibration; a noise of 1 is 0.15 px, 0.3 mm and 0.03°."""
     rng = np.random.default_rng(seed)
     board = parse_board("charuco:9x7:25:18")
@@ -49,30 +59,16 @@ def make_cell(
         side = np.append(rng.uniform(-tilt, tilt, 2), 0)
         eye = middle + np.array([0, 0, -1]) * rng.uniform(0.35, 0.6) + side
         T_board_cam = look_at(eye, middle + 0.02 * rng.normal(size=3), rng.uniform(-0.8, 0.8))
-        T_cam_board = invert_transform(T_board_cam)
-        pixels = cv2.projectPoints(
-            board.points,
-            cv2.Rodrigues(T_cam_board[:3, :3])[0],
-            T_cam_board[:3, 3],
-            camera.K,
-            camera.coefficients,
-        )[0][:, 0]
         M = Y @ T_board_cam @ invert_transform(X)
         M = M if mount == "hand" else invert_transform(M)
-        rotation = Rotation.from_rotvec(noise * np.radians(0.03) * rng.normal(size=3)).as_matrix()
-        robot.append(
-            make_transform(M[:3, :3] @ rotation, M[:3, 3] + noise * 3e-4 * rng.normal(size=3))
-        )
-        pixels = pixels + 0.15 * noise * rng.normal(size=pixels.shape)
-        detections.append(BoardDetection(f"{number:02d}.png", board.points, pixels))
+        turn = Rotation.from_rotvec(noise * np.radians(0.03) * rng.normal(size=3)).as_matrix()
+        shift = noise * 3e-4 * rng.normal(size=3)
+        robot.append(make_transform(M[:3, :3] @ turn, M[:3, 3] + shift))
+        T_cam_board, name = invert_transform(T_board_cam), f"{number:02d}.png"
+        detections.append(take(board, T_cam_board, camera, name, 0.15 * noise, rng))
     return Cell(camera, X, Y, np.array(robot), detections)
 
 
 @pytest.fixture(scope="session")
-def cell() -> Callable[..., Cell]:
+def cell():
     return make_cell
-
-
-@pytest.fixture(scope="session")
-def looking_at() -> Callable[..., np.ndarray]:
-    return look_at

@@ -13,21 +13,20 @@ ROTATION = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 POSITION = [0.4, -0.1, 0.3]
 
 
-def record():
-    return {"name": "a.png", "x": POSITION[0], "y": POSITION[1], "z": POSITION[2]}
-
-
-RECORDS = [
-    dict(zip(("qw", "qx", "qy", "qz"), ROTATION.as_quat(scalar_first=True).tolist(), strict=True)),
-    dict(zip(("rx", "ry", "rz"), ROTATION.as_rotvec().tolist(), strict=True)),
-    dict(zip(("roll", "pitch", "yaw"), ROTATION.as_euler("xyz").tolist(), strict=True)),
-]
-
-
-@pytest.mark.parametrize("rotation", RECORDS)
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        ("qw qx qy qz", ROTATION.as_quat(scalar_first=True)),
+        ("rx ry rz", ROTATION.as_rotvec()),
+        ("roll pitch yaw", ROTATION.as_euler("xyz")),
+    ],
+    ids=["quaternion", "rotation vector", "angles"],
+)
 @pytest.mark.parametrize("suffix", [".csv", ".json", ".yaml"])
-def test_a_pose_is_the_same_in_every_format(tmp_path, rotation, suffix):
-    path, fields = tmp_path / f"poses{suffix}", {**record(), **rotation}
+def test_a_pose_is_the_same_in_every_format(tmp_path, names, numbers, suffix):
+    values = ["a.png", *POSITION, *numbers.tolist()]
+    fields = dict(zip(["name", "x", "y", "z", *names.split()], values, strict=True))
+    path = tmp_path / f"poses{suffix}"
     if suffix == ".csv":
         text = ";".join(fields) + "\n" + ";".join(map(str, fields.values())) + "\n"
     else:
@@ -76,10 +75,8 @@ def test_an_invalid_file_is_rejected_in_one_line(tmp_path, name, text, message):
 def test_poses_are_paired_with_their_images(tmp_path):
     path = tmp_path / "p.csv"
     path.write_text("image,x,y,z,rx,ry,rz\nb,1,2,3,0,0,0\na,1,2,3,0,0,0\n")
-    assert match_images(read_robot_poses(path), ["a.png", "b.png", "c.png"]) == {
-        "b.png": 0,
-        "a.png": 1,
-    }
+    pairs = match_images(read_robot_poses(path), ["a.png", "b.png", "c.png"])
+    assert pairs == {"b.png": 0, "a.png": 1}
     with pytest.raises(UserError, match="the first 'b'"):
         match_images(read_robot_poses(path), ["a.png"])
     path.write_text("x,y,z,rx,ry,rz\n1,2,3,0,0,0\n")

@@ -4,12 +4,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.board import board_pose
 from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, park, robot_world_equations, shah
-
-
-def boards_of(cell):
-    return [board_pose(detection, cell.camera) for detection in cell.detections]
 
 
 def difference(T, other):
@@ -22,7 +17,7 @@ def difference(T, other):
 @pytest.mark.parametrize("solve", [park, shah])
 def test_closed_forms_are_exact_without_noise(cell, mount, solve):
     given = cell(4, mount=mount, noise=0)
-    M, B, _ = robot_world_equations(given.T_base_flange, boards_of(given), mount)
+    M, B, _ = robot_world_equations(given.T_base_flange, given.boards, mount)
     X, Y = solve(M, B)
     assert max(difference(X, given.T_mount_cam)) < 1e-3
     assert max(difference(Y, given.T_other_board)) < 1e-3
@@ -31,10 +26,9 @@ def test_closed_forms_are_exact_without_noise(cell, mount, solve):
 @pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="not in this OpenCV")
 def test_park_agrees_with_opencv(cell):
     given = cell(4)
-    M, B, _ = robot_world_equations(given.T_base_flange, boards_of(given), "hand")
-    R, t = cv2.calibrateHandEye(
-        M[:, :3, :3], M[:, :3, 3], B[:, :3, :3], B[:, :3, 3], method=cv2.CALIB_HAND_EYE_PARK
-    )
+    M, B, _ = robot_world_equations(given.T_base_flange, given.boards, "hand")
+    blocks = M[:, :3, :3], M[:, :3, 3], B[:, :3, :3], B[:, :3, 3]
+    R, t = cv2.calibrateHandEye(*blocks, method=cv2.CALIB_HAND_EYE_PARK)
     X, _ = park(M, B)
     assert np.allclose(X[:3, :3], R, atol=1e-6)
     assert np.allclose(X[:3, 3], t.ravel(), atol=1e-6)
@@ -45,7 +39,7 @@ def test_the_error_of_the_camera_is_below_a_millimetre_and_fits_its_covariance(c
     squares = []
     for seed in range(8):
         given = cell(seed, mount=mount)
-        result = calibrate_hand_eye(given.T_base_flange, boards_of(given), mount)
+        result = calibrate_hand_eye(given.T_base_flange, given.boards, mount)
         angle, shift = difference(given.T_mount_cam, result.T_mount_cam)
         assert angle < 0.1
         assert shift < 1.0
@@ -61,10 +55,8 @@ def test_the_error_of_the_camera_is_below_a_millimetre_and_fits_its_covariance(c
 def test_poses_that_contradict_the_others_are_rejected(cell):
     given = cell(5)
     given.T_base_flange[3, :3, 3] += [0.02, 0, 0]
-    given.T_base_flange[11, :3, :3] = (
-        given.T_base_flange[11, :3, :3] @ Rotation.from_euler("x", 3, degrees=True).as_matrix()
-    )
-    result = calibrate_hand_eye(given.T_base_flange, boards_of(given), "hand")
+    given.T_base_flange[11, :3, :3] @= Rotation.from_euler("x", 3, degrees=True).as_matrix()
+    result = calibrate_hand_eye(given.T_base_flange, given.boards, "hand")
     assert set(np.flatnonzero(~result.inliers)) == {3, 11}
     assert difference(given.T_mount_cam, result.T_mount_cam)[1] < 1.0
 
@@ -73,16 +65,15 @@ def test_joint_refinement_improves_its_initial_values(cell):
     closed, joint = [], []
     for seed in range(10):
         given = cell(seed)
-        boards = boards_of(given)
+        boards = given.boards
         M, B, _ = robot_world_equations(given.T_base_flange, boards, "hand")
         closed.append(difference(given.T_mount_cam, park(M, B)[0]))
-        joint.append(
-            difference(given.T_mount_cam, calibrate_hand_eye(M, boards, "hand").T_mount_cam)
-        )
+        refined = calibrate_hand_eye(M, boards, "hand").T_mount_cam
+        joint.append(difference(given.T_mount_cam, refined))
     assert (np.median(joint, axis=0) < np.median(closed, axis=0)).all()
 
 
 def test_two_poses_are_rejected(cell):
     given = cell(0, num=2)
     with pytest.raises(UserError, match="at least 3"):
-        calibrate_hand_eye(given.T_base_flange, boards_of(given), "hand")
+        calibrate_hand_eye(given.T_base_flange, given.boards, "hand")

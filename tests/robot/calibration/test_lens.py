@@ -5,16 +5,17 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera import move_pose
 from dopepp.geometry.camera_file import read_camera
 from dopepp.robot.calibration.board import BoardDetection, parse_board
 from dopepp.robot.calibration.lens import MAX_VIEWS, Views, calibrate_lens, write_camera
+from tests.robot.calibration.conftest import take
 
 
 @pytest.fixture(scope="module")
 def views(cell):
     """The camera, and views of a board that reach the corners of the image."""
-    result = cell(3, num=4)
-    camera, rng = result.camera, np.random.default_rng(1)
+    camera, rng = cell(3, num=4).camera, np.random.default_rng(1)
     board = parse_board("charuco:9x7:25:18")
     detections = []
     for number in range(16):
@@ -35,8 +36,7 @@ def test_the_errors_of_the_lens_fit_its_deviations(views):
     assert (np.abs(errors) < 4 * result.deviations).all()
     assert np.abs(errors).max() < 1.0
     assert result.error_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
-    assert not result.findings
-    assert not result.outliers
+    assert (result.findings, result.outliers) == ((), ())
 
 
 def test_the_file_is_read_by_every_camera_option(views, tmp_path):
@@ -44,17 +44,15 @@ def test_the_file_is_read_by_every_camera_option(views, tmp_path):
     result = calibrate_lens(detections, camera.size).camera
     write_camera(tmp_path / "camera.yaml", result)
     again = read_camera(tmp_path / "camera.yaml")
-    assert again.size == result.size
     assert np.array_equal(again.K, result.K)
-    assert again.distortion == result.distortion
+    assert (again.size, again.distortion) == (result.size, result.distortion)
 
 
 def test_a_view_that_contradicts_the_others_is_rejected_by_name(views):
     camera, detections = views
-    rng = np.random.default_rng(2)
-    bent = replace(
-        detections[5], pixels=detections[5].pixels + 6 * rng.normal(size=detections[5].pixels.shape)
-    )
+    pixels = detections[5].pixels
+    noise = 6 * np.random.default_rng(2).normal(size=pixels.shape)
+    bent = replace(detections[5], pixels=pixels + noise)
     result = calibrate_lens([*detections[:5], bent, *detections[6:]], camera.size)
     assert result.outliers == ("5.png",)
     assert abs(result.camera.K[0, 0] - camera.K[0, 0]) < 1.5
@@ -63,22 +61,16 @@ def test_a_view_that_contradicts_the_others_is_rejected_by_name(views):
 def test_views_in_the_middle_only_are_not_trusted(views):
     camera, detections = views
     wide = tuple(3 * side for side in camera.size)
-    middle = [
-        replace(detection, pixels=detection.pixels + np.array(camera.size))
-        for detection in detections
-    ]
+    middle = [replace(seen, pixels=seen.pixels + np.array(camera.size)) for seen in detections]
     assert any("cover" in finding for finding in calibrate_lens(middle, wide).findings)
 
 
 def test_parallel_views_are_not_trusted(views):
     camera, _ = views
-    board = parse_board("charuco:9x7:25:18")
-    parallel = [
-        BoardDetection(str(k), board.points, cv2.projectPoints(
-            board.points, np.array([0.01 * k, 0, 0.2 * k]), np.array([0.03 * k - 0.2, -0.1, 0.4]),
-            camera.K, camera.coefficients)[0][:, 0])
-        for k in range(8)
-    ]  # fmt: skip
+    board, parallel = parse_board("charuco:9x7:25:18"), []
+    for k in range(8):
+        T = move_pose(np.eye(4), np.array([0.01 * k, 0, 0.2 * k, 0.03 * k - 0.2, -0.1, 0.4]))
+        parallel.append(take(board, T, camera, str(k)))
     assert any("parallel" in finding for finding in calibrate_lens(parallel, camera.size).findings)
 
 
@@ -119,9 +111,7 @@ def test_the_number_of_views_is_limited():
 
 
 def test_a_rotated_board_is_another_view():
-    views = Views(1000)
-    rotated = BoardDetection(
-        "rotated", POINTS, 1000 * POINTS[:, :2] @ np.array([[0.0, 1], [-1, 0]])
-    )
+    views, quarter = Views(1000), np.array([[0.0, 1], [-1, 0]])
+    rotated = BoardDetection("rotated", POINTS, 1000 * POINTS[:, :2] @ quarter)
     assert views.add(at(0, "straight"))
     assert views.add(rotated)

@@ -1,6 +1,5 @@
 """Faults of robot poses, each recognised, and the quality of a hand-eye calibration."""
 
-import csv
 import re
 from dataclasses import replace
 
@@ -9,31 +8,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.board import board_pose
 from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
 from dopepp.robot.calibration.quality import assess, check_poses, expected_error
 from dopepp.robot.calibration.records import PoseFormat, read_robot_poses
-
-QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 def write(path, T, kind="quaternion", unit=1.0, degrees=False, xyzw=False):
     rotation = Rotation.from_matrix(T[:, :3, :3])
     names, numbers = {
-        "quaternion": (QUATERNION, rotation.as_quat(scalar_first=not xyzw)),
-        "rotvec": (("rx", "ry", "rz"), rotation.as_rotvec(degrees=degrees)),
-        "euler": (("roll", "pitch", "yaw"), rotation.as_euler("xyz", degrees=degrees)),
+        "quaternion": ("qw,qx,qy,qz", rotation.as_quat(scalar_first=not xyzw)),
+        "rotvec": ("rx,ry,rz", rotation.as_rotvec(degrees=degrees)),
+        "euler": ("roll,pitch,yaw", rotation.as_euler("xyz", degrees=degrees)),
     }[kind]
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["x", "y", "z", *names])
-        rows.writerows(np.hstack([T[:, :3, 3] / unit, numbers]).tolist())
+    rows = np.hstack([T[:, :3, 3] / unit, numbers])
+    np.savetxt(path, rows, "%.17g", ",", header=f"x,y,z,{names}", comments="")
     return path
 
 
 def check(given, path, pose_format, mount):
-    boards = [board_pose(detection, given.camera) for detection in given.detections]
-    poses = read_robot_poses(path)
+    boards, poses = given.boards, read_robot_poses(path)
     return check_poses(poses, range(len(boards)), pose_format, boards, mount)
 
 
@@ -55,7 +48,7 @@ def test_poses_under_the_right_convention_pass(cell, tmp_path, mount, style, pos
     assert np.allclose(flanges, given.T_base_flange, atol=1e-9)
 
 
-FAULTS = [
+@pytest.mark.parametrize(("style", "pose_format", "mount", "message"), [
     # style of the file, convention under which it is read, mount, message
     ({"unit": 1e-3}, PoseFormat(), "hand", "--unit mm"),
     ({"unit": 1e-2}, PoseFormat(), "bench", "--unit cm"),
@@ -71,10 +64,7 @@ FAULTS = [
     ({"kind": "euler", "degrees": True, "unit": 1e-3}, PoseFormat(), "bench", "--unit mm"),
     ({}, PoseFormat(inverted=True), "hand", "--direction"),
     ({}, PoseFormat(inverted=True), "bench", "--direction"),
-]
-
-
-@pytest.mark.parametrize(("style", "pose_format", "mount", "message"), FAULTS)
+])  # fmt: skip
 def test_a_wrong_convention_is_recognised(cell, tmp_path, style, pose_format, mount, message):
     given = cell(2, mount=mount)
     path = write(tmp_path / "poses.csv", given.T_base_flange, **style)
@@ -82,43 +72,37 @@ def test_a_wrong_convention_is_recognised(cell, tmp_path, style, pose_format, mo
         check(given, path, pose_format, mount)
 
 
-def on_a_larger_board(given):
-    given.detections = [
-        replace(detection, points=detection.points * 0.8) for detection in given.detections
-    ]
+def larger(detections):
+    return [replace(detection, points=detection.points * 0.8) for detection in detections]
 
 
-def standing_still(given):
-    given.T_base_flange[:] = given.T_base_flange[0]
-
-
-def one_image(given):
-    given.detections = given.detections[:1] * 20
-
-
-def one_late(given):
-    given.T_base_flange = np.roll(given.T_base_flange, 1, axis=0)
-
-
-def one_early(given):
-    given.T_base_flange = np.roll(given.T_base_flange, -1, axis=0)
+def unchanged(values):
+    return values
 
 
 @pytest.mark.parametrize(
-    ("change", "mount", "message"),
+    ("of_poses", "of_detections", "mount", "message"),
     [
-        (lambda _: None, "bench", "camera on the other mount"),
-        (on_a_larger_board, "hand", r"squares \(they may be 1\.2\d+ times"),
-        (standing_still, "hand", "the robot rotates by 0"),
-        (one_image, "hand", "the board, seen by the camera, rotates by 0"),
-        (one_late, "hand", "poses fit the"),
-        (one_early, "hand", "poses fit the"),
+        (unchanged, unchanged, "bench", "camera on the other mount"),
+        (unchanged, larger, "hand", r"squares \(they may be 1\.2\d+ times"),
+        (lambda T: T[:1].repeat(20, 0), unchanged, "hand", "the robot rotates by 0"),
+        (
+            unchanged,
+            lambda seen: seen[:1] * 20,
+            "hand",
+            "the board, seen by the camera, rotates by 0",
+        ),
+        (lambda T: np.roll(T, 1, axis=0), unchanged, "hand", "poses fit the"),
+        (lambda T: np.roll(T, -1, axis=0), unchanged, "hand", "poses fit the"),
     ],
+    ids=["other mount", "larger board", "robot at rest", "one image", "one late", "one early"],
 )
-def test_poses_that_contradict_the_images_are_recognised(cell, tmp_path, change, mount, message):
+def test_poses_that_contradict_the_images_are_recognised(
+    cell, tmp_path, of_poses, of_detections, mount, message
+):
     given = cell(2)
-    change(given)
-    path = write(tmp_path / "poses.csv", given.T_base_flange)
+    given.detections = of_detections(given.detections)
+    path = write(tmp_path / "poses.csv", of_poses(given.T_base_flange))
     with pytest.raises(UserError, match=message):
         check(given, path, PoseFormat(), mount)
 
@@ -138,7 +122,7 @@ def test_good_poses_with_two_outliers_pass(cell, tmp_path, seed):
 
 def test_leave_one_out_finds_the_pose_with_the_largest_influence(cell):
     given = cell(6)
-    boards = [board_pose(detection, given.camera) for detection in given.detections]
+    boards = given.boards
     calibration = calibrate_hand_eye(given.T_base_flange, boards, "hand")
     quality = assess(given.T_base_flange, boards, calibration)
     assert not quality.findings
@@ -152,12 +136,11 @@ def test_leave_one_out_finds_the_pose_with_the_largest_influence(cell):
 
 def test_rotations_about_a_single_axis_are_not_trusted(cell):
     given = cell(7, tilt=0.01)  # from straight above, rotated about the optical axis only
-    boards = [board_pose(detection, given.camera) for detection in given.detections]
+    boards = given.boards
     calibration = calibrate_hand_eye(given.T_base_flange, boards, "hand")
     quality = assess(given.T_base_flange, boards, calibration)
     assert any("nearly parallel axes only" in finding for finding in quality.findings)
-    optical = given.T_mount_cam[:3, 2]
-    assert abs(quality.weakest @ optical) > 0.9
+    assert abs(quality.weakest @ given.T_mount_cam[:3, 2]) > 0.9  # the optical axis
 
 
 def test_the_expected_error_agrees_with_drawn_calibrations():

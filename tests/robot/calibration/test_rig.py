@@ -2,17 +2,16 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
+from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform, step_between
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import BoardDetection, parse_board
+from dopepp.robot.calibration.board import parse_board
 from dopepp.robot.calibration.rig import calibrate_rig
-from tests.robot.calibration.conftest import look_at
+from tests.robot.calibration.conftest import look_at, take
 
 BOARD = parse_board("chess:7x10:25")
 NOISE = 0.15  # pixels
@@ -33,24 +32,14 @@ def draw_detections(seed=0, moments=8, names=tuple(POSES)):
     """Return the detections of a board at random poses, in the cameras' images."""
     rng = np.random.default_rng(seed)
     boards = {name: {} for name in names}
-    for moment in range(moments):
+    for file in (f"{moment}.png" for moment in range(moments)):
         rotation = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, 3)).as_matrix()
         position = CENTRE + rng.uniform(-0.05, 0.05, 3) - rotation @ BOARD.points.mean(axis=0)
         T_world_board = make_transform(rotation, position)
         for name in names:
-            T, lens = invert_transform(POSES[name]) @ T_world_board, LENSES[name]
-            rotation_vector, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3]
-            parameters = rotation_vector, shift, lens.K, lens.coefficients
-            pixels = cv2.projectPoints(BOARD.points, *parameters)[0][:, 0]
-            pixels = pixels + rng.normal(0, NOISE, pixels.shape)
-            boards[name][f"{moment}.png"] = BoardDetection(f"{moment}.png", BOARD.points, pixels)
+            T = invert_transform(POSES[name]) @ T_world_board
+            boards[name][file] = take(BOARD, T, LENSES[name], file, NOISE, rng)
     return boards
-
-
-def step(T, true):
-    """Return the rotation about the camera's centre and the shift between two poses."""
-    rotation = Rotation.from_matrix(T[:3, :3] @ true[:3, :3].T).as_rotvec()
-    return np.concatenate([rotation, T[:3, 3] - true[:3, 3]])
 
 
 def test_the_poses_of_the_cameras_are_estimated():
@@ -60,7 +49,7 @@ def test_the_poses_of_the_cameras_are_estimated():
     np.testing.assert_array_equal(rig.T_world_cam[0], np.eye(4))
     for T, true in zip(rig.T_world_cam, POSES.values(), strict=True):
         assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 5e-4
-        assert np.degrees(np.linalg.norm(step(T, true)[:3])) < 0.05
+        assert np.degrees(np.linalg.norm(step_between(true, T)[:3])) < 0.05
     np.testing.assert_allclose(rig.errors_px, NOISE * np.sqrt(2), rtol=0.1)
 
 
@@ -69,7 +58,7 @@ def test_stated_deviations_are_those_of_repeated_calibrations():
     for seed in range(8):
         rig = calibrate_rig(draw_detections(seed, moments=5), LENSES)
         for number, true in list(enumerate(POSES.values()))[1:]:
-            error = step(rig.T_world_cam[number], true)
+            error = step_between(true, rig.T_world_cam[number])
             squares.append(error @ np.linalg.solve(rig.covariances[number], error) / 6)
     assert 0.8 < np.sqrt(np.mean(squares)) < 1.25
     np.testing.assert_array_equal(rig.deviations[0], 0)

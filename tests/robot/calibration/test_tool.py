@@ -15,9 +15,8 @@ TIP, PIVOT = np.array([0.01, -0.02, 0.15]), np.array([0.4, 0.1, 0.05])
 def touching(rotations, noise=0.0, seed=0):
     rng = np.random.default_rng(seed)
     shifts = PIVOT - rotations.apply(TIP) + noise * rng.normal(size=(len(rotations), 3))
-    return np.array(
-        [make_transform(R, t) for R, t in zip(rotations.as_matrix(), shifts, strict=True)]
-    )
+    pairs = zip(rotations.as_matrix(), shifts, strict=True)
+    return np.array([make_transform(*pair) for pair in pairs])
 
 
 @settings(max_examples=30)
@@ -44,9 +43,8 @@ def test_rotations_about_one_axis_do_not_determine_the_tip():
 
 
 def test_a_touch_beside_the_point_is_a_finding():
-    poses = touching(
-        Rotation.from_euler("xyz", np.random.default_rng(1).uniform(-0.7, 0.7, (9, 3)))
-    )
+    tilts = Rotation.from_euler("xyz", np.random.default_rng(1).uniform(-0.7, 0.7, (9, 3)))
+    poses = touching(tilts)
     poses[4, :3, 3] += [0.01, 0, 0]
     assert any("pose 5" in finding for finding in find_tip(poses).findings)
 
@@ -58,9 +56,8 @@ def test_three_touches_are_rejected():
 
 def test_a_bench_is_estimated_with_its_frame():
     rng = np.random.default_rng(0)
-    T = make_transform(
-        Rotation.from_euler("xyz", [3, -4, 60], degrees=True).as_matrix(), [0.5, 0.1, -0.02]
-    )
+    R = Rotation.from_euler("xyz", [3, -4, 60], degrees=True).as_matrix()
+    T = make_transform(R, [0.5, 0.1, -0.02])
     local = np.array([[0, 0, 0], [0.3, 0, 0], [0.1, 0.2, 0], [0.3, 0.3, 0], [-0.1, 0.2, 0]])
     result = find_bench(transform(T, local) + 1e-4 * rng.normal(size=local.shape))
     assert np.allclose(result.T_base_bench[:3, :3], T[:3, :3], atol=2e-3)

@@ -1,6 +1,5 @@
 """Trials run in several processes, and the report counts them as Table 9 does."""
 
-import csv
 import json
 from concurrent.futures import Future
 from dataclasses import replace
@@ -8,18 +7,10 @@ from dataclasses import replace
 import pytest
 
 from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import read_csv
 from dopepp.core.pool import LostWorkerError, ProcessPool
 from dopepp.robot.grasping import grasp_experiment
-from dopepp.robot.grasping.grasp_experiment import (
-    HeapCounts,
-    check_task,
-    count_heaps,
-    count_records,
-    markdown,
-    parse_sources,
-    run_trials,
-    write_report,
-)
+from dopepp.robot.grasping.grasp_experiment import HeapCounts, check_task, markdown, run_trials
 from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, Record
 
 
@@ -55,13 +46,12 @@ def test_failures_are_counted_by_kind(records):
     text = markdown(records, {})
     row = next(line for line in text.splitlines() if line.startswith("| network |"))
     assert row.split("|")[-6:-1] == [" 1 ", " 0 ", " 1 ", " 0 ", " 2 "]
-    assert count_records(records).trials == 3 * 54
+    assert grasp_experiment.count_records(records).trials == 3 * 54
 
 
 def test_all_formats_hold_every_trial(records, tmp_path):
-    write_report(tmp_path, records, {"seed": 0})
-    with (tmp_path / "grasps.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    grasp_experiment.write_report(tmp_path, records, {"seed": 0})
+    rows = read_csv(tmp_path / "grasps.csv")
     content = json.loads((tmp_path / "grasps.json").read_text())
     assert len(rows) == len(content["trials"]) == len(records)
     assert content["sources"]["network"]["caught"] == 50
@@ -81,7 +71,8 @@ def test_heaps_are_counted_by_their_last_attempt():
 
     # A heap emptied in four attempts, one in two with a double catch, and one left with a part.
     heaps = [*attempts(0, 1, 0, 1, 1), *attempts(1, 2, 1), *attempts(2, 0, 1, 0, 1, 0, 0)]
-    assert count_heaps(heaps[::-1]) == HeapCounts(3, emptied=2, parts=9, lifted=8, attempts=12)
+    counts = HeapCounts(3, emptied=2, parts=9, lifted=8, attempts=12)
+    assert grasp_experiment.count_heaps(heaps[::-1]) == counts
     text = markdown(heaps, {})
     assert "| network | 3 | 66.7 % (20.8 – 93.9) | 8 of 9 | 66.7 % (20.8 – 93.9) |" in text
     row = next(line for line in text.splitlines() if line.startswith("| network | 12 |"))
@@ -116,6 +107,7 @@ def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
 
 
 def test_equal_sources_are_used_once_and_a_curve_is_many_sources():
+    parse_sources = grasp_experiment.parse_sources
     assert parse_sources("exact, exact,random") == (PoseSource("exact"), PoseSource("random"))
     names = [source.name for source in parse_sources("curve")]
     assert names[0] == "exact poses, off by 1 mm and 1°"
@@ -125,5 +117,6 @@ def test_equal_sources_are_used_once_and_a_curve_is_many_sources():
 
 
 def test_a_network_is_omitted_if_no_source_needs_it():
-    assert check_task(replace(TASK, network="net.ckpt"), "exact", 1).network is None
-    assert check_task(replace(TASK, network="net.ckpt"), "network,exact", 1).network == "net.ckpt"
+    task = replace(TASK, network="net.ckpt")
+    assert check_task(task, "exact", 1).network is None
+    assert check_task(task, "network,exact", 1).network == "net.ckpt"

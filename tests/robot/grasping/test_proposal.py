@@ -5,12 +5,13 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.parts.part import Mesh, make_part
+from dopepp.parts.part import make_part
 from dopepp.robot.grasping.grasps import propose_grasps
+from tests.parts.makers import mesh_of
 
 
-def part_of(solid, name="solid"):
-    return make_part(name, Mesh(np.array(solid.vertices), np.array(solid.faces, np.int32)))
+def part_of(solid):
+    return make_part("solid", mesh_of(solid))
 
 
 @pytest.mark.parametrize("extents", [(0.06, 0.03, 0.02), (0.12, 0.05, 0.007)])

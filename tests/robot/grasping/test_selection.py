@@ -7,20 +7,14 @@ import pytest
 
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME
-from dopepp.robot.grasping.selection import (
-    EstimatedPart,
-    choose_part,
-    covered_share,
-    pick_score,
-)
+from dopepp.robot.grasping.selection import EstimatedPart, choose_part, covered_share, pick_score
 
 GRID = np.stack(np.meshgrid(np.arange(0, 0.1, 0.002), np.arange(0, 0.05, 0.002), [0.0]), -1)
 PLATE = GRID.reshape(-1, 3)  # a flat plate of 100 × 50 mm, points 2 mm apart
 
 
-def at(x, z, turn=0.0):
-    c, s = np.cos(turn), np.sin(turn)
-    return make_transform(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([x, 0.0, z]))
+def at(x, z):
+    return make_transform(np.eye(3), np.array([x, 0.0, z]))
 
 
 @pytest.mark.parametrize(("shift", "share"), [(0.0, 1.0), (0.05, 0.5), (0.08, 0.2), (0.2, 0.0)])

@@ -24,11 +24,9 @@ def planner(trials, scene):
 
 def test_a_part_at_a_known_pose_is_caught(trials, scene):
     attempt = trials.attempt(scene, PoseSource("exact"))
-    assert attempt.record.caught
-    assert attempt.record.recognised
-    assert (attempt.record.failure, attempt.record.add_mm) == ("", 0)
+    record, states = attempt.record, attempt.outcome.states
+    assert (record.caught, record.recognised, record.failure, record.add_mm) == (True, True, "", 0)
     # At the end, the part hangs above its initial position on the bench.
-    states = attempt.outcome.states
     assert states[-1][-5] > states[0][-5] + 0.1
 
 
@@ -37,9 +35,8 @@ def test_a_part_at_another_pose_is_not_caught(trials, scene, monkeypatch):
     aside = [EstimatedPart(pose @ shift) for pose in scene.targets]
     monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation(aside, scene.joints))
     record = trials.attempt(scene, PoseSource("exact")).record
-    assert not record.caught
-    assert not record.recognised
-    assert (record.failure, record.error_mm) == ("wrong pose", pytest.approx(50))
+    result = record.caught, record.recognised, record.failure, record.error_mm
+    assert result == (False, False, "wrong pose", pytest.approx(50))
 
 
 def test_no_estimated_pose_is_the_failure_not_seen(trials, scene, monkeypatch):
@@ -116,15 +113,9 @@ def test_there_is_no_plan(trials, scene, planner, shift, rotation):
 
 @pytest.mark.parametrize(
     ("tilt_deg", "rise", "is_aligned"),
-    [
-        (0, 0, True),
-        (3, 0.002, True),
-        (6, -0.003, True),
-        (30, 0, True),
-        (30, 0.02, False),
-        (1, 0.02, False),
-    ],
-)
+    [(0, 0, True), (3, 0.002, True), (6, -0.003, True), (30, 0, True), (30, 0.02, False),
+     (1, 0.02, False)],
+)  # fmt: skip
 def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is_aligned):
     bench = make_transform(np.eye(3), np.array([0.3, 0.1, 0.02]))
     flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
@@ -174,9 +165,7 @@ def test_a_lift_that_moves_a_part_on_top_reduces_the_quality(crowded):
 
 
 def test_a_motion_passes_its_waypoints_from_rest_to_rest(scene):
-    path = np.stack(
-        [scene.joints, scene.joints + 0.3, scene.joints + np.array([0.5, 0, 0, 0, 0, 0.1])]
-    )
+    path = scene.joints + np.array([[0] * 6, [0.3] * 6, [0.5, 0, 0, 0, 0, 0.1]])
     joints, speeds = (np.array(values) for values in zip(*_sample_path(path), strict=True))
     np.testing.assert_allclose(joints[-1], path[-1], atol=1e-9)
     assert np.abs(joints - path[1]).max(axis=1).min() < 0.01
@@ -187,8 +176,7 @@ def test_a_motion_passes_its_waypoints_from_rest_to_rest(scene):
 
 def test_a_plan_through_the_part_is_a_collision(trials, scene, planner):
     plan = planner.plan(scene.targets, trials.grasps, scene.joints)
-    closed = replace(plan, opening=0.0)
     execution = Execution(scene.cell, copy(scene.start), trials.gripper, scene.robot.zero)
-    outcome = execution.run(closed)
+    outcome = execution.run(replace(plan, opening=0.0))
     assert outcome.collided
     assert outcome.times == sorted(outcome.times)

@@ -1,9 +1,6 @@
 """Rendered images of a part, as messages of a camera's driver and as a recording."""
 
-from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,15 +16,6 @@ TOPIC = "/camera/image_raw"
 LENS = [-0.05, 0.01, 0.001, -0.001, 0.0]
 
 
-@dataclass
-class CameraImages:
-    """Images of a camera, its matrix, and a folder with the same images."""
-
-    images: list[np.ndarray]
-    K: np.ndarray
-    folder: Path
-
-
 @pytest.fixture(scope="session")
 def estimator():
     return PoseEstimator.load("pretrained/pivconnector")
@@ -35,20 +23,22 @@ def estimator():
 
 @pytest.fixture(scope="session")
 def camera(tmp_path_factory):
+    """Images of a camera, its matrix, and a folder with the same images."""
     factory = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2)
     rendered = [factory.render(0, number) for number in (9, 10, 11)]
     folder = tmp_path_factory.mktemp("images")
     for number, item in enumerate(rendered):
         write_png(folder / f"{number}.png", item.image)
-    return CameraImages([item.image for item in rendered], rendered[0].scene.K, folder)
+    images = [item.image for item in rendered]
+    return SimpleNamespace(images=images, K=rendered[0].scene.K, folder=folder)
 
 
-def header(second: float, frame_id: str = FRAME) -> SimpleNamespace:
+def header(second, frame_id=FRAME):
     stamp = SimpleNamespace(sec=int(second), nanosec=round(1e9 * (second % 1)))
     return SimpleNamespace(stamp=stamp, frame_id=frame_id)
 
 
-def image_message(image: np.ndarray, second: float, frame_id: str = FRAME) -> SimpleNamespace:
+def image_message(image, second, frame_id=FRAME):
     height, width = image.shape[:2]
     return SimpleNamespace(
         header=header(second, frame_id), height=height, width=width, encoding="rgb8",
@@ -56,7 +46,7 @@ def image_message(image: np.ndarray, second: float, frame_id: str = FRAME) -> Si
     )  # fmt: skip
 
 
-def info_message(K: np.ndarray, size: tuple[int, int], **changes: Any) -> SimpleNamespace:
+def info_message(K, size, **changes):
     roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
     fields = {
         "header": header(1.0), "width": size[0], "height": size[1],
@@ -80,7 +70,7 @@ def recording(camera, tmp_path_factory):
 
     store = get_typestore(Stores.ROS2_HUMBLE)
 
-    def native(kind: str, message: Any) -> Any:
+    def native(kind, message):
         fields = {}
         for name, node in store.fielddefs[kind][1]:
             value = getattr(message, name)
@@ -96,17 +86,13 @@ def recording(camera, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bag") / "run"
     plugin = rosbag2.StoragePlugin.MCAP
     with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as writer:
-        kinds = {
-            TOPIC: "sensor_msgs/msg/Image",
-            "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
-        }
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=store)
-            for topic, kind in kinds.items()
-        }
+        topics = {}
+        for topic, name in ((TOPIC, "Image"), ("/camera/camera_info", "CameraInfo")):
+            kind = f"sensor_msgs/msg/{name}"
+            topics[kind] = writer.add_connection(topic, kind, typestore=store)
         for number, image in enumerate(camera.images, 1):
-            info = info_message(camera.K, (320, 240))
-            for topic, message in zip(kinds, (image_message(image, number), info), strict=True):
-                content = store.serialize_cdr(native(kinds[topic], message), kinds[topic])
-                writer.write(connections[topic], number * 10**9, content)
+            sent = image_message(image, number), info_message(camera.K, (320, 240))
+            for (kind, connection), message in zip(topics.items(), sent, strict=True):
+                content = store.serialize_cdr(native(kind, message), kind)
+                writer.write(connection, number * 10**9, content)
     return next(folder.glob("*.mcap"))

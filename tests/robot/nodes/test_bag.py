@@ -12,6 +12,8 @@ pytest.importorskip("rosbags")
 from rosbags import rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from dopepp.geometry.camera import make_transform
+
 MODEL = "pretrained/pivconnector"
 
 
@@ -34,20 +36,16 @@ def messages(run, recording, tmp_path_factory):
 
 
 def test_poses_equal_those_of_predict(run, messages, recording):
-    lines = run("predict", MODEL, recording).stdout.splitlines()
-    expected = [json.loads(line) for line in lines]
-    result = [
-        (detection, message.header)
-        for _, message in messages["/dope/detections"]
-        for detection in message.detections
-    ]
+    expected = list(map(json.loads, run("predict", MODEL, recording).stdout.splitlines()))
+    sent = [message for _, message in messages["/dope/detections"]]
+    result = [(found, message.header) for message in sent for found in message.detections]
     assert len(result) == len(expected) >= 2
     for (first, header), plain in zip(result, expected, strict=True):
-        pose, T = first.results[0].pose.pose, np.array(plain["T_cam_obj"])
+        pose = first.results[0].pose.pose
         position, rotation = pose.position, pose.orientation
-        np.testing.assert_allclose([position.x, position.y, position.z], T[:3, 3], atol=1e-6)
         R = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
-        np.testing.assert_allclose(R, T[:3, :3], atol=1e-6)
+        T = make_transform(R, [position.x, position.y, position.z])
+        np.testing.assert_allclose(T, plain["T_cam_obj"], atol=1e-6)
         assert first.results[0].hypothesis.score == pytest.approx(plain["score"], abs=1e-6)
         assert header.stamp.sec == plain["time"]
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera import make_transform
 from dopepp.inference.pose_result import PoseResult
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.messages import MARKER_FACES, AnswerFormatter, diagnosis
@@ -22,24 +23,21 @@ def parts(estimator):
 def answer(camera, parts):
     rng = np.random.default_rng(0)
     detections = []
+    nowhere = np.zeros((9, 2))
     for score in (0.9, 0.7):
-        T = np.eye(4)
-        T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-        T[:3, 3] = rng.normal(size=3)
+        T = make_transform(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
         half = rng.normal(size=(6, 6))
-        detections.append(Detection(parts[0].name, score, score, T, np.zeros((9, 2)),
-                               np.zeros((9, 2)), 1.0, half @ half.T))  # fmt: skip
+        estimate = T, nowhere, nowhere, 1.0, half @ half.T
+        detections.append(Detection(parts[0].name, score, score, *estimate))
     result = PoseResult(camera.images[0], camera.K, detections, {}, "/camera/image_raw")
     return Answer(Stamp(7, 5), "camera_optical_frame", result)
 
 
 def transform(pose):
-    T = np.eye(4)
     rotation = pose.get("orientation", pose.get("rotation"))
     position = pose.get("position", pose.get("translation"))
-    T[:3, :3] = Rotation.from_quat([rotation[k] for k in "xyzw"]).as_matrix()
-    T[:3, 3] = [position[k] for k in "xyz"]
-    return T
+    R = Rotation.from_quat([rotation[k] for k in "xyzw"]).as_matrix()
+    return make_transform(R, [position[k] for k in "xyz"])
 
 
 def messages_of(answer, parts):
@@ -60,9 +58,8 @@ def test_all_topics_hold_the_same_poses(answer, parts):
     np.testing.assert_allclose(both, [best, second], atol=1e-12)
     frames = messages["/tf"].fields["transforms"]
     assert [frame["child_frame_id"] for frame in frames] == [f"{name}_0", f"{name}_1"]
-    np.testing.assert_allclose(
-        [transform(frame["transform"]) for frame in frames], [best, second], atol=1e-12
-    )
+    both = [transform(frame["transform"]) for frame in frames]
+    np.testing.assert_allclose(both, [best, second], atol=1e-12)
     detections = messages["detections"].fields["detections"]
     assert [detection["id"] for detection in detections] == [f"{name}_0", f"{name}_1"]
     result = detections[1]["results"][0]
@@ -74,10 +71,8 @@ def test_covariances_are_of_translation_and_rotation_in_this_order(answer, parts
     covariance = answer.result.detections[0].covariance
     fields = messages_of(answer, parts)["detections"].fields
     numbers = fields["detections"][0]["results"][0]["pose"]["covariance"]
-    ros = np.reshape(numbers, (6, 6))
-    np.testing.assert_array_equal(ros[:3, :3], covariance[3:, 3:])
-    np.testing.assert_array_equal(ros[3:, 3:], covariance[:3, :3])
-    np.testing.assert_array_equal(ros[:3, 3:], covariance[3:, :3])
+    order = [3, 4, 5, 0, 1, 2]
+    np.testing.assert_array_equal(np.reshape(numbers, (6, 6)), covariance[order][:, order])
 
 
 def test_boxes_and_markers_enclose_the_part(answer, parts):
@@ -114,6 +109,8 @@ def test_names_are_converted_for_topics_or_rejected(answer, parts):
 
 
 def test_a_diagnosis_warns_of_a_problem():
-    fine, bad = (diagnosis(Stamp(1, 2), "dope", problem, {"rate": "3"}) for problem in ("", "oh"))
-    assert fine.fields["status"][0]["level"] == 0
-    assert (bad.fields["status"][0]["level"], bad.fields["status"][0]["message"]) == (1, "oh")
+    fine, bad = (
+        diagnosis(Stamp(1, 2), "dope", problem, {"rate": "3"}).fields["status"][0]
+        for problem in ("", "oh")
+    )
+    assert (fine["level"], bad["level"], bad["message"]) == (0, 1, "oh")

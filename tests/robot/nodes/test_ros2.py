@@ -1,7 +1,5 @@
 """The ROS 2 node: native messages, parameters, best-effort cameras and the slot of images."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
@@ -14,21 +12,16 @@ from dopepp.robot.nodes.messages import diagnosis, image_fields
 from dopepp.robot.nodes.ros2 import Pace, Slot, _Node, native
 from dopepp.robot.nodes.worker import Stamp, Worker, WorkerSettings
 
-ROOT = Path(__file__).parents[3]
-
 
 def test_messages_are_converted_to_native_messages():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
-
     message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
     filled = native(message.kind, message.fields)
     assert (filled.header.stamp.sec, filled.status[0].level) == (3, b"\x01")
     assert filled.status[0].values[0].value == "30"
     image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    native_image = native("sensor_msgs/Image", image_fields(image, {}))
-    np.testing.assert_array_equal(
-        np.frombuffer(native_image.data, np.uint8).reshape(2, 4, 3), image
-    )
+    data = native("sensor_msgs/Image", image_fields(image, {})).data
+    np.testing.assert_array_equal(np.frombuffer(data, np.uint8).reshape(2, 4, 3), image)
 
 
 def test_parameters_change_while_the_node_runs(estimator, tmp_path):
@@ -82,10 +75,9 @@ def test_images_of_a_best_effort_camera_arrive(estimator, camera, caplog):
 @pytest.mark.slow
 def test_no_image_is_lost_between_processes_and_a_killed_node_restarts():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
-    command = [sys.executable, str(ROOT / "benchmarks" / "node.py"), "--rate", "10"]
-    done = subprocess.run(
-        [*command, "--pictures", "50"], capture_output=True, text=True, timeout=280, check=False
-    )
+    script = Path(__file__).parents[3] / "benchmarks" / "node.py"
+    command = [sys.executable, str(script), "--rate", "10", "--pictures", "50"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
     assert done.returncode == 0, done.stderr
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines() if line.startswith("| 50")]
     assert len(rows) == 2

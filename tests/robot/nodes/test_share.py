@@ -42,15 +42,11 @@ def test_the_launch_file_uses_existing_options(monkeypatch):
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
     declared = runpy.run_path(str(SHARE / "dope_launch.py"))["generate_launch_description"]()
     assert words_started[:4] == ["dopepp", "node", "<model>", "--ros2"]
-    assert {f"<{item}>" for item in declared[:-1]} == {
-        element for element in words_started if element[0] == "<"
-    }
-    assert {word for word in words_started if word.startswith("--")} <= options()
-
-
-def options():
+    used = {element for element in words_started if element[0] == "<"}
+    assert used == {f"<{item}>" for item in declared[:-1]}
     command = typer.main.get_command(app).commands["node"]
-    return {text for item in command.params for text in item.opts}
+    options = {text for item in command.params for text in item.opts}
+    assert {word for word in words_started if word.startswith("--")} <= options
 
 
 def words(content):

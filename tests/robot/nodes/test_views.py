@@ -1,7 +1,5 @@
 """Images of several cameras: poses in the world, camera poses from a file or TF, diagnostics."""
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import replace
@@ -66,7 +64,7 @@ def poses_of(stereo, camera=None):
 
 @pytest.mark.parametrize("track", [False, True])
 def test_poses_are_those_of_predict_views_in_the_world(estimator, stereo, shots, track):
-    warnings: list[str] = []
+    warnings = []
     worker = ViewsWorker(estimator, poses_of(stereo), "bench", track=track, warn=warnings.append)
     answer = worker.process(*shots())
     cameras = [stereo.K] * 2
@@ -90,7 +88,7 @@ def test_poses_are_those_of_predict_views_in_the_world(estimator, stereo, shots,
 
 
 def test_missing_transforms_and_cameras_are_one_warning(estimator, stereo, shots):
-    warnings: list[str] = []
+    warnings = []
     worker = ViewsWorker(estimator, None, warn=warnings.append)
 
     def missing(frame, stamp):

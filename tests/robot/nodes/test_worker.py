@@ -10,6 +10,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.nodes.worker import PATIENCE, Shot, Stamp, Worker, WorkerSettings
+from tests.robot.nodes.conftest import LENS
 
 
 @pytest.fixture
@@ -38,16 +39,13 @@ def take(worker, camera, messages):
 
 def test_poses_are_those_of_the_undistorted_image(worker, take, estimator, camera, warnings):
     answer = take(second=12.25)
-    undistorted = cv2.undistort(
-        camera.images[0], camera.K, np.array([-0.05, 0.01, 0.001, -0.001, 0])
-    )
+    undistorted = cv2.undistort(camera.images[0], camera.K, np.array(LENS))
     expected = estimator.predict(undistorted, camera.K)
     assert expected
     for detection, other in zip(answer.result.detections, expected, strict=True):
         np.testing.assert_allclose(detection.T_cam_obj, other.T_cam_obj, atol=1e-9)
     assert (answer.stamp, answer.frame_id) == (Stamp(12, 250_000_000), "camera_optical_frame")
-    assert not warnings
-    assert worker.problem == ""
+    assert (warnings, worker.problem) == ([], "")
 
 
 @pytest.mark.parametrize(
@@ -85,10 +83,8 @@ def test_several_images_without_camera_info_are_one_warning(take, warnings):
 def test_a_given_camera_replaces_camera_info(estimator, camera, messages, warnings):
     worker = Worker(estimator, camera=Camera(None, camera.K, (), "--K"), warn=warnings.append)
     answer = worker.process(Shot(messages.image(camera.images[0], 1), None, messages.topic))
-    expected = estimator.predict(camera.images[0], camera.K)
-    np.testing.assert_allclose(
-        answer.result.detections[0].T_cam_obj, expected[0].T_cam_obj, atol=1e-9
-    )
+    result, expected = answer.result.detections, estimator.predict(camera.images[0], camera.K)
+    np.testing.assert_allclose(result[0].T_cam_obj, expected[0].T_cam_obj, atol=1e-9)
     assert not warnings
 
 
@@ -122,14 +118,13 @@ def test_a_missing_stamp_and_unreadable_images_are_warnings(
     worker, take, messages, camera, warnings
 ):
     assert take(second=0) is not None
-    bad = messages.image(camera.images[0], 1)
+    image, info = messages.image(camera.images[0], 1), messages.info(camera.K, (320, 240))
     for change in ({"encoding": "16UC1"}, {"data": b"12"}, {"height": 10**9}):
-        changed = SimpleNamespace(**vars(bad) | change)
-        info = messages.info(camera.K, (320, 240))
+        changed = SimpleNamespace(**vars(image) | change)
         assert worker.process(Shot(changed, info, messages.topic)) is None
-    assert len(warnings) == 2
-    assert "without a stamp" in warnings[0]
-    assert "16UC1" in warnings[1]
+    without_stamp, unreadable = warnings
+    assert "without a stamp" in without_stamp
+    assert "16UC1" in unreadable
 
 
 def test_binning_and_region_of_interest_change_the_camera(worker, estimator, camera, messages):
@@ -166,13 +161,9 @@ def test_settings_change_while_the_node_runs(worker, take):
 def test_tracked_parts_keep_their_numbers(estimator, camera, messages, warnings):
     tracking = Worker(estimator, WorkerSettings(refine=True), track=True, warn=warnings.append)
     info = messages.info(camera.K, (320, 240), d=[0.0] * 5)
-    numbers = [
-        tracking.process(
-            Shot(messages.image(camera.images[0], second), info, messages.topic)
-        ).numbers
-        for second in (1, 2, 3)
-    ]
-    assert numbers == [[0]] * 3
+    for second in (1, 2, 3):
+        shot = Shot(messages.image(camera.images[0], second), info, messages.topic)
+        assert tracking.process(shot).numbers == [0]
     with pytest.raises(UserError, match="--track"):
         tracking.update(WorkerSettings(refine=False))
     assert not warnings

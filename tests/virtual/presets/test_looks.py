@@ -20,22 +20,20 @@ from dopepp.virtual import (
 from dopepp.virtual.presets.looks import black_body_rgb
 
 
-def planck_rgb(temperature: float) -> np.ndarray:
+def planck_rgb(temperature):
     """Integrate Planck's law over Wyman, Sloan and Shirley's fits of the CIE 1931 observer."""
     nm = np.arange(380.0, 781.0)
 
-    def lobe(height: float, centre: float, left: float, right: float) -> np.ndarray:
+    def lobe(height, centre, left, right):
         scaled = (nm - centre) * np.where(nm < centre, left, right)
         return height * np.exp(-0.5 * scaled**2)
 
-    observer = np.array(
-        [
-            lobe(1.056, 599.8, 0.0264, 0.0323) + lobe(0.362, 442.0, 0.0624, 0.0374)
-            + lobe(-0.065, 501.1, 0.0490, 0.0382),
-            lobe(0.821, 568.8, 0.0213, 0.0247) + lobe(0.286, 530.9, 0.0613, 0.0322),
-            lobe(1.217, 437.0, 0.0845, 0.0278) + lobe(0.681, 459.0, 0.0385, 0.0725),
-        ]
-    )  # fmt: skip
+    observer = np.array([
+        lobe(1.056, 599.8, 0.0264, 0.0323) + lobe(0.362, 442.0, 0.0624, 0.0374)
+        + lobe(-0.065, 501.1, 0.0490, 0.0382),
+        lobe(0.821, 568.8, 0.0213, 0.0247) + lobe(0.286, 530.9, 0.0613, 0.0322),
+        lobe(1.217, 437.0, 0.0845, 0.0278) + lobe(0.681, 459.0, 0.0385, 0.0725),
+    ])  # fmt: skip
     power = nm**-5.0 / (np.exp(1.4387769e7 / (nm * temperature)) - 1)
     x, y, z = observer @ power
     xyz = np.array([x / y, 1.0, z / y])
@@ -73,8 +71,7 @@ def test_materials_keep_to_their_ranges_and_shares(box_surface):
     ranges = Materials(metal_share=0.3, brushed_share=0.5, print_share=0.6)
     rng = np.random.default_rng(0)
     drawn = [ranges.draw(rng, box_surface) for _ in range(3000)]
-    metals = [m for m in drawn if m.metallic]
-    plastics = [m for m in drawn if not m.metallic]
+    metals, plastics = ([m for m in drawn if bool(m.metallic) == kind] for kind in (True, False))
     assert len(metals) / 3000 == pytest.approx(0.3, abs=0.03)
     assert np.mean([m.grooves is not None for m in metals]) == pytest.approx(0.5, abs=0.06)
     assert np.mean([m.grooves is not None for m in plastics]) == pytest.approx(0.6, abs=0.04)
@@ -101,8 +98,7 @@ def test_textured_surfaces_keep_their_colours(sheet):
         material = Materials(metal_share=1.0).draw(rng, surface)
         assert material.colour[0] == material.colour[1] == material.colour[2]
         assert 0.7 <= material.colour[0] <= 1.2
-        assert material.metallic == material.noise == 0
-        assert material.grooves is None
+        assert (material.metallic, material.noise, material.grooves) == (0, 0, None)
     # A tint changes every channel by a share of its own.
     materials = Materials(texture_gain=(1.0, 1.0), texture_tint=0.2)
     colours = np.array([materials.draw(rng, surface).colour for _ in range(2000)])

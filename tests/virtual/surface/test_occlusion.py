@@ -6,25 +6,24 @@ import trimesh
 from manifold3d import Manifold
 
 from dopepp.parts.part import Mesh
-from dopepp.virtual import Surface, make_surface
+from dopepp.virtual import make_surface
 from dopepp.virtual.surface.occlusion import look_up_sky, spread_directions
 
 
-def made(solid: Manifold) -> Surface:
+def made(solid):
     mesh = solid.to_mesh()
-    return make_surface(
-        Mesh(np.asarray(mesh.vert_properties, float)[:, :3], np.asarray(mesh.tri_verts, np.int32))
-    )
+    vertices = np.asarray(mesh.vert_properties, float)[:, :3]
+    return make_surface(Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
 
 
-def looked_up(surface: Surface, face: np.ndarray, share: np.ndarray) -> np.ndarray:
+def looked_up(surface, face, share):
     out, sky = np.empty(len(face), np.float32), surface.sky
     weights = np.ascontiguousarray(share.T, np.float32)
     look_up_sky(face.astype(np.int32), weights, sky.steps, sky.firsts, sky.values, out)
     return out
 
 
-def ray_cast(surface: Surface, origins: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def ray_cast(surface, origins, normals):
     """Cosine-weighted open share by Möller–Trumbore over all triangles."""
     directions = spread_directions(800)
     corners = surface.vertices[surface.faces]

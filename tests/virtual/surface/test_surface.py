@@ -9,21 +9,23 @@ import trimesh
 from dopepp.core.errors import UserError
 from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface
+from tests.parts.makers import mesh_of
 
 FACE = np.array([(0, 1, 2)], np.int32)
 
 
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def test_cad_edges_stay_sharp_and_cylinders_are_smooth(surface_of):
     surface = surface_of(trimesh.creation.box((0.1, 0.1, 0.1)))
-    corners = surface.vertices[surface.faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    a, b, c = surface.vertices[surface.faces].swapaxes(0, 1)
+    flat = unit(np.cross(b - a, c - a))
     np.testing.assert_allclose(surface.normals, flat[:, None].repeat(3, axis=1), atol=1e-6)
     surface = surface_of(trimesh.creation.cylinder(0.05, 0.1, sections=24))
-    positions = surface.vertices[surface.faces]
     side = np.abs(surface.normals[..., 2]) < 0.5
-    radial = positions[side] * (1, 1, 0)
-    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
+    radial = unit(surface.vertices[surface.faces][side] * (1, 1, 0))
     np.testing.assert_allclose(surface.normals[side], radial, atol=0.02)
     np.testing.assert_allclose(np.abs(surface.normals[~side][:, 2]), 1, atol=1e-6)
 
@@ -34,9 +36,7 @@ def test_split_vertices_are_merged_into_a_closed_smooth_surface():
     soup = np.asarray(ball.triangles).reshape(-1, 3)
     surface = make_surface(Mesh(soup, np.arange(len(soup), dtype=np.int32).reshape(-1, 3)))
     assert surface.closed
-    outward = surface.vertices[surface.faces]
-    outward = outward / np.linalg.norm(outward, axis=2, keepdims=True)
-    np.testing.assert_allclose(surface.normals, outward, atol=0.03)
+    np.testing.assert_allclose(surface.normals, unit(surface.vertices[surface.faces]), atol=0.03)
 
 
 def test_open_and_inside_out_meshes_are_not_closed(surface_of):
@@ -53,8 +53,7 @@ def test_stretching_keeps_normals_upright(surface_of):
     scale = np.array([0.1, 0.2, 0.05])
     stretched = surface_of(trimesh.creation.icosphere(3, 1.0)).scaled(scale)
     # The gradient of the ellipsoid's equation.
-    outward = stretched.vertices[stretched.faces] / scale**2
-    outward /= np.linalg.norm(outward, axis=2, keepdims=True)
+    outward = unit(stretched.vertices[stretched.faces] / scale**2)
     np.testing.assert_allclose(stretched.normals, outward, atol=0.05)
 
 
@@ -87,7 +86,7 @@ def test_faces_without_area_change_nothing(sheet):
 def test_a_files_normals_are_used_where_they_fit_the_surface():
     # The vertex normals of a box are averaged over three sides, so they fit none.
     box = trimesh.creation.box((0.1, 0.1, 0.1))
-    mesh = Mesh(box.vertices, box.faces.astype(np.int32))
+    mesh = mesh_of(box)
     given = replace(mesh, normals=np.asarray(box.vertex_normals))
     np.testing.assert_array_equal(make_surface(given).normals, make_surface(mesh).normals)
     ball = trimesh.creation.icosphere(3, 0.05)

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 
@@ -44,12 +43,12 @@ def library(tmp_path, monkeypatch):
     return path
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> list[list[str]]:
+def stand_in(monkeypatch, code):
     """Run other code in place of the trial; return the list of commands so far."""
-    commands: list[list[str]] = []
+    commands = []
     run = subprocess.run
 
-    def record(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    def record(command, **options):
         commands.append(command)
         return run([sys.executable, "-c", code], **options)
 

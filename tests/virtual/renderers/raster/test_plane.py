@@ -7,9 +7,10 @@ import pytest
 import trimesh
 
 from dopepp.geometry.camera import make_transform, project
-from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface, render, visible_fractions
-from dopepp.virtual.scene import Ambient, Light, Plane, Rendered, Scene, SceneObject
+from dopepp.virtual.scene import Ambient, Light, Plane, SceneObject
+from tests.parts.makers import mesh_of
+from tests.virtual.conftest import even_light, pixel_rays
 
 ANGLE = 0.7
 NORMAL = np.array([0.0, -np.sin(ANGLE), -np.cos(ANGLE)])
@@ -17,29 +18,28 @@ NORMAL = np.array([0.0, -np.sin(ANGLE), -np.cos(ANGLE)])
 
 PLANE = Plane(tuple(NORMAL), float(NORMAL[2] * 0.5))
 IMAGE = {"size": (320, 240), "focal": 320.0}
-DARK = Ambient(above=(0, 0, 0), below=(0, 0, 0))
+DARK = even_light(0.0)
 
 
-def on_plane(x: float, y: float, height: float) -> np.ndarray:
+def on_plane(x, y, height):
     """A point in the camera frame, from plane coordinates around its middle."""
     side = np.array([1.0, 0, 0])
     return np.array([0, 0, 0.5]) + x * side + y * np.cross(NORMAL, side) + height * NORMAL
 
 
-def box_at(x: float, y: float, height: float, extents: tuple[float, float, float]) -> SceneObject:
+def box_at(x, y, height, extents):
     """A box whose bottom hovers over the plane."""
-    box = trimesh.creation.box(extents)
     side = np.array([1.0, 0, 0])
     rotation = np.stack([side, np.cross(NORMAL, side), NORMAL], axis=1)
-    surface = make_surface(Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
+    surface = make_surface(mesh_of(trimesh.creation.box(extents)))
     return SceneObject(surface, make_transform(rotation, on_plane(x, y, height + extents[2] / 2)))
 
 
-def drawn(scene: Scene) -> Rendered:
+def drawn(scene):
     return render(replace(scene, plane=PLANE))
 
 
-def brightness(rendered: Rendered, point: np.ndarray) -> float:
+def brightness(rendered, point):
     u, v = np.round(project(point, rendered.scene.K)).astype(int)
     assert rendered.instances[v, u] == -1
     return float(rendered.image[v, u, 1])
@@ -50,9 +50,7 @@ def test_depth_is_the_closed_form_and_stops_at_the_horizon(scene_of):
     normal = np.array([0.0, -np.cos(0.1), -np.sin(0.1)])
     scene = replace(scene_of(**IMAGE), plane=Plane(tuple(normal), -0.3))
     rendered = render(scene)
-    v, u = np.mgrid[:240, :320]
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(scene.K).T
-    expected = -0.3 / (rays @ normal)
+    expected = -0.3 / (pixel_rays(scene) @ normal)
     in_front = expected > 0
     assert 0.3 < in_front.mean() < 0.9
     assert (rendered.depth[~in_front] == 0).all()
@@ -81,9 +79,8 @@ def test_parts_below_the_plane_are_hidden_and_reduce_the_visible_fraction(scene_
     assert (rendered.visible_fractions[1], rendered.visible_fractions[2]) == (0, 1)
     assert (rendered.instances != 1).all()
     alone = render(replace(scene, plane=None, objects=(sunk,)))
-    points = np.argwhere(alone.instances == 0)
-    rays = np.stack([points[:, 1], points[:, 0], np.ones(len(points))]).T @ np.linalg.inv(scene.K).T
-    heights = (rays * alone.depth[points[:, 0], points[:, 1]][:, None]) @ NORMAL - PLANE.offset
+    inside = alone.instances == 0
+    heights = (pixel_rays(scene)[inside] @ NORMAL) * alone.depth[inside] - PLANE.offset
     assert rendered.visible_fractions[0] == pytest.approx((heights > 0).mean(), abs=0.01)
     assert 0.3 < rendered.visible_fractions[0] < 0.9
     np.testing.assert_array_equal(visible_fractions(scene), rendered.visible_fractions)

@@ -1,9 +1,7 @@
 """The rasteriser against closed forms and an independent ray caster."""
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,26 +15,23 @@ from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.parts import load_part
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh
-from dopepp.virtual import Surface, make_surface, render
+from dopepp.virtual import make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.renderers.raster import visibility as shadow_module
-from dopepp.virtual.renderers.raster.visibility import ShadowMap, shadow_map
-from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.renderers.raster.visibility import shadow_map
+from dopepp.virtual.scene import Light, Material, Scene, SceneObject
+from tests.virtual.conftest import even_light, pixel_rays
 
-MakeScene = Callable[..., Scene]
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
 LARGE = {"size": (640, 480), "focal": 600.0}
 
 
-def at(surface: Surface, x: float, y: float, z: float) -> SceneObject:
+def at(surface, x, y, z):
     return SceneObject(surface, make_transform(np.eye(3), np.array([x, y, z])))
 
 
-def cast_rays(scene: Scene) -> np.ndarray:
+def cast_rays(scene):
     """Depth at every pixel centre by Möller–Trumbore over all triangles; inf for no hit."""
-    width, height = scene.size
-    v, u = np.mgrid[:height, :width].reshape(2, -1)
-    rays = np.stack([u, v, np.ones_like(u)], axis=1) @ np.linalg.inv(scene.K).T
+    rays = pixel_rays(scene).reshape(-1, 3)
     depth = np.full(len(rays), np.inf)
     for item in scene.objects:
         corners = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces]
@@ -50,7 +45,7 @@ def cast_rays(scene: Scene) -> np.ndarray:
                 distance = (c - a) @ across / determinant
             hit = (first >= 0) & (second >= 0) & (first + second <= 1) & (distance > 0.01)
             depth[hit] = np.minimum(depth[hit], distance[hit])
-    return depth.reshape(height, width)
+    return depth.reshape(scene.size[::-1])
 
 
 def test_empty_scene_is_its_background(scene_of):
@@ -67,9 +62,7 @@ def test_plane_has_its_closed_form_depth(scene_of, sheet):
     offset = np.array([0.02, 0.01, 0.5])
     scene = scene_of(SceneObject(plane, make_transform(rotation, offset)))
     rendered = render(scene)
-    v, u = np.mgrid[: scene.size[1], : scene.size[0]]
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(scene.K).T
-    expected = rotation[:, 2] @ offset / (rays @ rotation[:, 2])
+    expected = rotation[:, 2] @ offset / (pixel_rays(scene) @ rotation[:, 2])
     assert (rendered.instances == 0).all()
     np.testing.assert_allclose(rendered.depth, expected, rtol=1e-6)
 
@@ -139,8 +132,7 @@ def test_vertices_bound_the_mask(scene_of, box_part, box_surface):
     # A pixel belongs to the mask when its centre is inside: the outermost one is < 1 px inside.
     low, high = keypoints.min(axis=0), keypoints.max(axis=0)
     inside = np.array([columns.min(), rows.min()]) - low, high - (columns.max(), rows.max())
-    assert np.min(inside) >= 0
-    assert np.max(inside) < 1.5
+    assert 0 <= np.min(inside) <= np.max(inside) < 1.5
 
 
 def test_edges_are_anti_aliased_by_coverage(scene_of, sheet):
@@ -155,7 +147,7 @@ def test_edges_are_anti_aliased_by_coverage(scene_of, sheet):
     assert (rendered.instances[60, 80], rendered.instances[60, 81]) == (-1, 0)
 
 
-def middle_depth(path: Path, scene_of: MakeScene, turn: np.ndarray) -> float:
+def middle_depth(path, scene_of, turn):
     mesh = load_part(path, "mm").mesh
     pose = make_transform(turn, np.array([0.0, 0.0, 0.4]))
     return float(render(scene_of(SceneObject(make_surface(mesh), pose))).depth[60, 80])
@@ -222,7 +214,7 @@ def test_a_huge_silhouette_is_counted_at_a_reduced_scale(scene_of, plate):
     assert fraction == pytest.approx(640 * 480 / area, rel=0.01)
 
 
-def without_casters(*arguments: object) -> ShadowMap:
+def without_casters(*arguments):
     """A shadow map that nothing was drawn into."""
     drawn = shadow_map(*arguments)
     return replace(drawn, inverse_depth=np.zeros_like(drawn.inverse_depth))
@@ -240,14 +232,13 @@ def test_a_smooth_body_of_few_triangles_does_not_shadow_itself(
         body.invert()
     surface = surface_of(body)
     rng = np.random.default_rng(3)
-    black = Ambient(above=(0.0, 0.0, 0.0), below=(0.0, 0.0, 0.0))
     for _ in range(4):
         pose = make_transform(random_rotation(rng), np.array([0.0, 0.0, 0.18]))
         side = rng.normal(size=2)
         x, y = side / np.linalg.norm(side)
         item = SceneObject(surface, pose, Material((0.9, 0.9, 0.9), 1.0, specular=0.0))
-        lights = (Light((x, y, 0.3)),)
-        scene = scene_of(item, lights=lights, ambient=black, size=(320, 240), focal=300.0)
+        light = {"lights": (Light((x, y, 0.3)),), "ambient": even_light(0.0)}
+        scene = scene_of(item, **light, size=(320, 240), focal=300.0)
         rendered = render(scene)
         with_shadow = rendered.image.astype(int)
         with monkeypatch.context() as patch:

@@ -9,30 +9,25 @@ import trimesh
 
 from dopepp.geometry.camera import make_transform, resize_camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.virtual import Surface, make_surface, render
+from dopepp.virtual import make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Panel, SceneObject
 from dopepp.virtual.sensor import decode_srgb
+from tests.virtual.conftest import even_light as even
 
 
-def even(light: float) -> Ambient:
-    return Ambient(above=(light,) * 3, below=(light,) * 3)
-
-
-def linear(codes: np.ndarray) -> np.ndarray:
+def linear(codes):
     return np.asarray(decode_srgb(np.asarray(codes) / 255))
 
 
-def facing(surface: Surface, place: tuple[float, float, float], *material: Material) -> SceneObject:
+def facing(surface, place, *material):
     return SceneObject(surface, make_transform(FACING, np.array(place)), *material)
 
 
 def test_texture_is_upright_and_rgb(scene_of, sheet):
     # Top half red, bottom half blue; the lower left texel block is green.
     texture = np.zeros((64, 64, 3), np.uint8)
-    texture[:32] = (200, 0, 0)
-    texture[32:] = (0, 0, 200)
-    texture[48:, :16] = (0, 200, 0)
+    texture[:32], texture[32:], texture[48:, :16] = (200, 0, 0), (0, 0, 200), (0, 200, 0)
     matt = Material((1, 1, 1), specular=0.0)
     item = facing(make_surface(sheet(0.2, texture)), (0, 0, 0.3), matt)
     image = render(scene_of(item, lights=(), ambient=even(0.4))).image
@@ -93,10 +88,8 @@ def tilted(sheet):
 
     def make(material, tilt=0.0, depth=0.4):
         turned = rotation_vector_to_matrix(np.array([tilt, 0, 0])) @ FACING
-        plain = replace(sheet(0.2), uv=None)
-        return SceneObject(
-            make_surface(plain), make_transform(turned, np.array([0, 0, depth])), material
-        )
+        surface = make_surface(replace(sheet(0.2), uv=None))
+        return SceneObject(surface, make_transform(turned, [0, 0, depth]), material)
 
     return make
 
@@ -171,9 +164,8 @@ def test_lines_only_cross_their_axis(scene_of, tilted):
     # Seen along the axis there is nothing to tilt: a print's top face shows no layer lines.
     lines = Material(grooves=Grooves((0, 0, 1), 0.004, 0.5))
     scene = scene_of(tilted(lines), lights=(Light((0.3, 0, 0)),))
-    np.testing.assert_array_equal(
-        render(scene).image, render(replace(scene, objects=(tilted(Material()),))).image
-    )
+    plain = replace(scene, objects=(tilted(Material()),))
+    np.testing.assert_array_equal(render(scene).image, render(plain).image)
 
 
 @pytest.mark.parametrize("irregularity", [0.0, 1.0])
@@ -185,9 +177,8 @@ def test_fine_grooves_match_supersampling(scene_of, tilted, pitch, irregularity)
     light = Light((0.3, -0.2, 0.0), (0.9, 0.9, 0.9), 0.5)
     scene = scene_of(item, lights=(light,), ambient=even(0.3), size=(80, 60))
     image = linear(render(scene).image)
-    large = replace(
-        scene, K=resize_camera(scene.K, 16, 16), background=np.zeros((960, 1280, 3), np.uint8)
-    )
+    background = np.zeros((960, 1280, 3), np.uint8)
+    large = replace(scene, K=resize_camera(scene.K, 16, 16), background=background)
     expected = cv2.resize(linear(render(large).image), scene.size, interpolation=cv2.INTER_AREA)
     inner = cv2.erode((render(scene).instances == 0).astype(np.uint8), np.ones((3, 3))) > 0
     error = (image - expected)[inner] / expected[inner].mean()
@@ -200,10 +191,8 @@ def test_unresolved_grooves_widen_the_highlight(scene_of, tilted):
     flash = Light((0, 0, 0), (0.02, 0.02, 0.02), 0.4)
     widths = []
     for material in (fine, replace(fine, grooves=None)):
-        image = linear(
-            render(scene_of(tilted(material, depth=0.2), lights=(flash,), ambient=even(0.0))).image
-        )
-        row = image[60, 20:140, 0]
+        scene = scene_of(tilted(material, depth=0.2), lights=(flash,), ambient=even(0.0))
+        row = linear(render(scene).image)[60, 20:140, 0]
         widths.append((row > (row.max() + row.min()) / 2).sum())
     assert widths[0] > 1.5 * widths[1]
 
