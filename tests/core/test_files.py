@@ -1,7 +1,5 @@
 """Files that are complete or absent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -9,14 +7,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import (
-    IMAGES,
-    check_target,
-    read_limited,
-    write_file,
-    write_image,
-    write_png,
-)
+from dopepp.core.files import IMAGES, check_target, read_limited, write_file, write_image, write_png
 
 
 def test_a_png_keeps_its_pixels_in_rgb(tmp_path):
@@ -68,17 +59,14 @@ def test_the_suffix_determines_the_format_of_an_image(name, head, tmp_path):
     assert np.abs(back.astype(int) - (200, 100, 50)).max() < 4
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("a.gif", r"suffixes \.png, \.jpg, \.jpeg"),
-        ("a", "to write; allowed"),
-        (".", "which is a folder; allowed"),
-        ("folder.png", "Is a directory"),
-        ("file/a.png", "File exists|Not a directory"),
-        ("/proc/none/a.png", "No such file"),
-    ],
-)
+@pytest.mark.parametrize(("name", "message"), [
+    ("a.gif", r"suffixes \.png, \.jpg, \.jpeg"),
+    ("a", "to write; allowed"),
+    (".", "which is a folder; allowed"),
+    ("folder.png", "Is a directory"),
+    ("file/a.png", "File exists|Not a directory"),
+    ("/proc/none/a.png", "No such file"),
+])  # fmt: skip
 def test_an_unwritable_target_is_refused(name, message, tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
