@@ -136,18 +136,21 @@ def test_a_bench_is_calibrated_from_a_board_on_it(run, refused, cell, tmp_path):
         assert message in refused("calibrate", "bench", folder, *words, *more)
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    (("board", "chess:8x6:20", "--out", "b.pdf"), "one even and one odd"),
-    (("board", "chess:8x5:20", "--out", "b.txt"), ".pdf"),
-    (("camera", ".", "--board", BOARD, "--out", "c.yaml"), "without images"),
-    (("camera", ".", "--board", BOARD, "--out", "c.json"), ".yaml"),
-    (("tcp", "none.csv", "--out", "t.yaml"), "none.csv"),
-    (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),
-    (("bench", "none.csv", "--out", "t.yaml"), "none.csv"),
-    (("bench", ".", "--out", "t.yaml"), "without --board"),
-    (("camera", "none.mp4", "--board", BOARD, "--out", "c.yaml"), "none.mp4"),
-    (("tcp", "none.csv", "--out", "t.yaml", "--angles", "grad"), "--angles grad"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("board", "chess:8x6:20", "--out", "b.pdf"), "one even and one odd"),
+        (("board", "chess:8x5:20", "--out", "b.txt"), ".pdf"),
+        (("camera", ".", "--board", BOARD, "--out", "c.yaml"), "without images"),
+        (("camera", ".", "--board", BOARD, "--out", "c.json"), ".yaml"),
+        (("tcp", "none.csv", "--out", "t.yaml"), "none.csv"),
+        (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),
+        (("bench", "none.csv", "--out", "t.yaml"), "none.csv"),
+        (("bench", ".", "--out", "t.yaml"), "without --board"),
+        (("camera", "none.mp4", "--board", BOARD, "--out", "c.yaml"), "none.mp4"),
+        (("tcp", "none.csv", "--out", "t.yaml", "--angles", "grad"), "--angles grad"),
+    ],
+)
 def test_wrong_options_are_one_line(refused, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     assert message in refused("calibrate", *words)

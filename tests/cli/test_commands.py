@@ -42,15 +42,18 @@ def test_predict_verifies_and_refines(run, checkpoint, image_file, tmp_path):
             assert json.loads(line)["kept"]  # a pose on noise is reported
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (["--refine", "depth"], "--refine depth without --depth"),
-    (["--depth", "d.png"], "--depth without --refine depth"),
-    (["--refine", "icp"], "refine=('icp',)"),
-    (["--refine", "region,"], "refine=('region', '')"),
-    (["--track", "--verify"], "--track with --verify"),
-    (["--verify", "--part", "x=servoholder"], "not in the checkpoint"),
-    (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--refine", "depth"], "--refine depth without --depth"),
+        (["--depth", "d.png"], "--depth without --refine depth"),
+        (["--refine", "icp"], "refine=('icp',)"),
+        (["--refine", "region,"], "refine=('region', '')"),
+        (["--track", "--verify"], "--track with --verify"),
+        (["--verify", "--part", "x=servoholder"], "not in the checkpoint"),
+        (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
+    ],
+)
 def test_wrong_options_of_predict_are_one_line(refused, checkpoint, image_file, options, message):
     assert message in refused("predict", checkpoint, image_file, *K, *options)
     assert refused("predict", image_file, image_file, *K, *options).startswith("got ")
@@ -120,13 +123,19 @@ def test_render_shows_a_users_camera(run, tmp_path, caplog):
     assert "servoholder: 139 – 244 pixels across; a pixel is 0.43 mm" in caplog.text
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--camera", "{camera}"], "got --camera without --working-distance 0.3,0.8; allowed: both"),
-    (["--working-distance", "0.3,0.8"], "got --working-distance without --camera"),
-    (["--camera", "{camera}", "--working-distance", "0.8,0.3"], "got working_distance=[0.8, 0"),
-    (["--camera", "{camera}", "--working-distance", "near"], "got --working-distance near; al"),
-    (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--camera", "{camera}"],
+            "got --camera without --working-distance 0.3,0.8; allowed: both",
+        ),
+        (["--working-distance", "0.3,0.8"], "got --working-distance without --camera"),
+        (["--camera", "{camera}", "--working-distance", "0.8,0.3"], "got working_distance=[0.8, 0"),
+        (["--camera", "{camera}", "--working-distance", "near"], "got --working-distance near; al"),
+        (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),
+    ],
+)
 def test_a_wrong_camera_is_one_line(refused, arguments, message, tmp_path):
     (tmp_path / "cam.yaml").write_text(CAMERA)
     given = [text.format(camera=tmp_path / "cam.yaml") for text in arguments]
@@ -142,44 +151,50 @@ def test_a_preview_renders_no_data_set(run, tmp_path):
     assert cv2.imread(f"{out}.preview.png").shape[2] == 3
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["-n", "0"], "got -n 0; allowed: 1 to"),
-    (["-n", "1000000001"], "got -n 1000000001; allowed: 1 to 1,000,000,000"),
-    ([], "got no number of images; allowed: -n NUMBER, or --preview"),
-    (["-n", "5", "--size", "4x4"], "got width=4 of "),
-    (["-n", "5", "--size", "big"], "got --size big; allowed: WIDTHxHEIGHT"),
-    (["-n", "many"], "Invalid value for '-n'"),
-    (["-n", "5", "--colour"], "No such option: --colour"),
-    (["-n", "5", "--backgrounds", "skimag"], "got no photo in the background folder skimag"),
-    (["-n", "5", "--unit", "furlong", "part.stl"], "got unit='furlong' for part.stl"),
-    (["-n", "5", "servoholder"], "got parts ['servoholder', 'servoholder'] to render"),
-    (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: bin, heap, paper, "),
-    (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
-    (["-n", "5", "--renderer", "gl"], "got renderer 'gl'; allowed: raster, photoreal"),
-    (["-n", "5", "--shard", "3/2"], "got shard '3/2'; allowed: i/n with 0 <= i < n"),
-    (["-n", "5", "--workers", "0"], "got --workers 0; allowed: 1 to 1024"),
-    (["-n", "5", "--engine", "slurm"], "got --engine slurm; allowed: local, ray"),
-    (["-n", "5", "--ray-address", "a:1"], "got --ray-address a:1 with --engine local"),
-    (["-n", "5", "--set", "lighting"], "got --set lighting; allowed: FIELD"),
-    (["-n", "5", "--seed", "-1"], "got seed -1; allowed: an integer >= 0"),
-    (["-n", "5", "/nowhere/part.stl"], "got mesh /nowhere/part.stl, no such file"),
-    (["-n", "5", "screw"], "got unknown part 'screw'"),
-    (["-n", "5", "--negatives", "servoholder"], "got negative servoholder"),
-    (["-n", "5", "--negatives", "a.stl", "b.stl"], "got b.stl after --negatives a.stl"),
-    (["-n", "5", "--out", "/dev/null/x"], "got folder /dev/null/x: Not a directory"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-n", "0"], "got -n 0; allowed: 1 to"),
+        (["-n", "1000000001"], "got -n 1000000001; allowed: 1 to 1,000,000,000"),
+        ([], "got no number of images; allowed: -n NUMBER, or --preview"),
+        (["-n", "5", "--size", "4x4"], "got width=4 of "),
+        (["-n", "5", "--size", "big"], "got --size big; allowed: WIDTHxHEIGHT"),
+        (["-n", "many"], "Invalid value for '-n'"),
+        (["-n", "5", "--colour"], "No such option: --colour"),
+        (["-n", "5", "--backgrounds", "skimag"], "got no photo in the background folder skimag"),
+        (["-n", "5", "--unit", "furlong", "part.stl"], "got unit='furlong' for part.stl"),
+        (["-n", "5", "servoholder"], "got parts ['servoholder', 'servoholder'] to render"),
+        (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: bin, heap, paper, "),
+        (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
+        (["-n", "5", "--renderer", "gl"], "got renderer 'gl'; allowed: raster, photoreal"),
+        (["-n", "5", "--shard", "3/2"], "got shard '3/2'; allowed: i/n with 0 <= i < n"),
+        (["-n", "5", "--workers", "0"], "got --workers 0; allowed: 1 to 1024"),
+        (["-n", "5", "--engine", "slurm"], "got --engine slurm; allowed: local, ray"),
+        (["-n", "5", "--ray-address", "a:1"], "got --ray-address a:1 with --engine local"),
+        (["-n", "5", "--set", "lighting"], "got --set lighting; allowed: FIELD"),
+        (["-n", "5", "--seed", "-1"], "got seed -1; allowed: an integer >= 0"),
+        (["-n", "5", "/nowhere/part.stl"], "got mesh /nowhere/part.stl, no such file"),
+        (["-n", "5", "screw"], "got unknown part 'screw'"),
+        (["-n", "5", "--negatives", "servoholder"], "got negative servoholder"),
+        (["-n", "5", "--negatives", "a.stl", "b.stl"], "got b.stl after --negatives a.stl"),
+        (["-n", "5", "--out", "/dev/null/x"], "got folder /dev/null/x: Not a directory"),
+    ],
+)
 def test_a_wrong_render_option_is_one_line_and_code_2(refused, arguments, message, tmp_path):
     assert refused(*RENDER, "--out", tmp_path / "out", *arguments).startswith(message)
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["render", "--out", "x", "-n", "5"], "Missing argument"),
-    (["render", "servoholder", "-n", "5"], "Missing option '--out'"),
-    (["rendr"], "No such command 'rendr'"),
-    (["check", "/nowhere"], "got /nowhere, which is not a folder"),
-    (["download", "coco"], "got unknown data set 'coco'; allowed: voc2007"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["render", "--out", "x", "-n", "5"], "Missing argument"),
+        (["render", "servoholder", "-n", "5"], "Missing option '--out'"),
+        (["rendr"], "No such command 'rendr'"),
+        (["check", "/nowhere"], "got /nowhere, which is not a folder"),
+        (["download", "coco"], "got unknown data set 'coco'; allowed: voc2007"),
+    ],
+)
 def test_a_wrong_command_is_one_line_and_code_2(refused, arguments, message):
     assert refused(*arguments).startswith(message)
 

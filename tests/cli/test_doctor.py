@@ -33,17 +33,20 @@ def test_a_good_image_passes_all_checks(run, folder):
     assert "of its outline agrees" in lines[-1]
 
 
-@pytest.mark.parametrize(("options", "line"), [
-    (["plain.png", "--camera", "K.txt"], "!! visibility: pivconnector is not detected"),
-    (["good.png", "--camera", "K.txt", "--at", "5,5"], "!! elsewhere: 1 of 1 detections"),
-    (["good.png", "--camera", "K.txt", "--empty"], "!! elsewhere: 1 of 1 detections"),
-    (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
-    (
-        ["good.png", "--camera", "K.txt", "--part", "piv.stl", "--unit", "cm"],
-        "!! part: pivconnector measures 105 × 52 × 7.0 mm, and its mesh 1050 × 520 × 70 mm, "
-        "10 times that; fix: it was read in cm and is in mm: --unit mm",
-    ),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["plain.png", "--camera", "K.txt"], "!! visibility: pivconnector is not detected"),
+        (["good.png", "--camera", "K.txt", "--at", "5,5"], "!! elsewhere: 1 of 1 detections"),
+        (["good.png", "--camera", "K.txt", "--empty"], "!! elsewhere: 1 of 1 detections"),
+        (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
+        (
+            ["good.png", "--camera", "K.txt", "--part", "piv.stl", "--unit", "cm"],
+            "!! part: pivconnector measures 105 × 52 × 7.0 mm, and its mesh 1050 × 520 × 70 mm, "
+            "10 times that; fix: it was read in cm and is in mm: --unit mm",
+        ),
+    ],
+)
 def test_problems_come_first(run, folder, options, line, monkeypatch):
     monkeypatch.chdir(folder)
     done = run("doctor", "--model", MODEL, *options, code=1)
@@ -51,14 +54,17 @@ def test_problems_come_first(run, folder, options, line, monkeypatch):
     assert "; fix: " in done.stdout.splitlines()[0]
 
 
-@pytest.mark.parametrize(("options", "line"), [
-    (["good.png"], "neither --K nor --camera"),
-    (["good.png", "--camera", "K.txt", "--at", "5"], "--at 5; allowed: u,v in pixels"),
-    (["good.png", "--camera", "K.txt", "--at", "5,5", "--empty"], "--at together with --empty"),
-    (["K.txt", "--camera", "K.txt"], "cannot identify the format"),
-    (["good.png", "--camera", "K.txt", "--refine", "magic"], "--refine magic; allowed: region"),
-    (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["good.png"], "neither --K nor --camera"),
+        (["good.png", "--camera", "K.txt", "--at", "5"], "--at 5; allowed: u,v in pixels"),
+        (["good.png", "--camera", "K.txt", "--at", "5,5", "--empty"], "--at together with --empty"),
+        (["K.txt", "--camera", "K.txt"], "cannot identify the format"),
+        (["good.png", "--camera", "K.txt", "--refine", "magic"], "--refine magic; allowed: region"),
+        (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),
+    ],
+)
 def test_wrong_input_is_one_line(refused, folder, options, line, monkeypatch):
     monkeypatch.chdir(folder)
     assert line in refused("doctor", "--model", MODEL, *options)

@@ -76,20 +76,23 @@ def test_proposed_grasps_hold_a_new_part(grasped, run, tmp_path):
     assert content["sources"]["exact poses"]["caught"] == 2
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    (["--layout", "pile"], "--layout pile"),
-    (["--renderer", "blender"], "--renderer blender"),
-    (["--rest", "back"], "--rest back"),
-    (["--poses", "truth"], "--poses truth"),
-    (["-n", "0"], "-n=0"),
-    (["--views", "3"], "--views=3"),
-    (["--views", "2", "--no-refine"], "--views 2 with --no-refine"),
-    (["--yaw", "270"], "--yaw=270"),
-    (["--part", "gearbox"], "gearbox"),
-    (["--network", "pretrained/servoholder"], "was not trained on pivconnector"),
-    (["--video", "film.avi"], "film.avi"),
-    (["--grasps", "none.yaml"], "none.yaml"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--layout", "pile"], "--layout pile"),
+        (["--renderer", "blender"], "--renderer blender"),
+        (["--rest", "back"], "--rest back"),
+        (["--poses", "truth"], "--poses truth"),
+        (["-n", "0"], "-n=0"),
+        (["--views", "3"], "--views=3"),
+        (["--views", "2", "--no-refine"], "--views 2 with --no-refine"),
+        (["--yaw", "270"], "--yaw=270"),
+        (["--part", "gearbox"], "gearbox"),
+        (["--network", "pretrained/servoholder"], "was not trained on pivconnector"),
+        (["--video", "film.avi"], "film.avi"),
+        (["--grasps", "none.yaml"], "none.yaml"),
+    ],
+)
 def test_wrong_options_are_one_line(refused, tmp_path, words, message):
     assert message in refused("grasp", "--out", tmp_path, "--workers", 1, *words)
 

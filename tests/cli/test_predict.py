@@ -100,26 +100,33 @@ def test_the_distortion_of_the_lens_is_corrected(poses, folder, rendered, tmp_pa
     assert np.abs(shown - rendered.image[200:450, 20:300]).mean() < 12
 
 
-@pytest.mark.parametrize(("name", "options", "message"), [
-    ("whole.png", [], "neither --K nor --camera"),
-    ("whole.png", ["--camera", "K.txt", "--K", "9", "9", "9", "9"], "--K and --camera"),
-    ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
-    ("whole.png", ["--camera", "whole.png"], "camera file"),
-    ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
-    ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the image was resized"),
-    ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cropped"),
-    ("4k.png", ["--camera", "plain.json"], "calibrate the camera at 3840×2160"),
-    ("4k.png", ["--camera", "K.txt"], "likely of 640×480"),
-    ("whole.png", ["--K", "100", "100", "63.5", "63.5"], "likely of 128×128"),
-    ("whole.png", ["--K", "nan", "100", "319.5", "239.5"], "3×3 pinhole"),
-    ("whole.png", ["--K", "0.1", "0.1", "319.5", "239.5"], "field of view of 5° – 150°"),
-    ("anim.gif", ["--camera", "K.txt"], "magick anim.gif image.png"),
-    ("raw.png", ["--camera", "K.txt"], "magick raw.png -auto-level"),
-    ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
-    pytest.param("whole.png", ["--camera", "K.txt", "--device", "cuda"], "device cuda (",
-                 marks=pytest.mark.skipif(torch.cuda.is_available(), reason="it has CUDA")),
-    ("97", ["--camera", "K.txt"], "got camera 97, which cannot be opened"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("whole.png", [], "neither --K nor --camera"),
+        ("whole.png", ["--camera", "K.txt", "--K", "9", "9", "9", "9"], "--K and --camera"),
+        ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
+        ("whole.png", ["--camera", "whole.png"], "camera file"),
+        ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
+        ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the image was resized"),
+        ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cropped"),
+        ("4k.png", ["--camera", "plain.json"], "calibrate the camera at 3840×2160"),
+        ("4k.png", ["--camera", "K.txt"], "likely of 640×480"),
+        ("whole.png", ["--K", "100", "100", "63.5", "63.5"], "likely of 128×128"),
+        ("whole.png", ["--K", "nan", "100", "319.5", "239.5"], "3×3 pinhole"),
+        ("whole.png", ["--K", "0.1", "0.1", "319.5", "239.5"], "field of view of 5° – 150°"),
+        ("anim.gif", ["--camera", "K.txt"], "magick anim.gif image.png"),
+        ("raw.png", ["--camera", "K.txt"], "magick raw.png -auto-level"),
+        ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
+        pytest.param(
+            "whole.png",
+            ["--camera", "K.txt", "--device", "cuda"],
+            "device cuda (",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="it has CUDA"),
+        ),
+        ("97", ["--camera", "K.txt"], "got camera 97, which cannot be opened"),
+    ],
+)
 def test_wrong_input_is_one_line(refused, folder, name, options, message, monkeypatch):
     monkeypatch.chdir(folder)
     line = refused("predict", RELEASED, name, *options)
@@ -127,12 +134,15 @@ def test_wrong_input_is_one_line(refused, folder, name, options, message, monkey
     assert message in line
 
 
-@pytest.mark.parametrize(("option", "name", "message"), [
-    ("--save", "file", "file"),
-    ("--save", "/proc/none", "No such file"),
-    ("--json", "", "Is a directory"),
-    ("--csv", "poses.txt", ".csv"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("option", "name", "message"),
+    [
+        ("--save", "file", "file"),
+        ("--save", "/proc/none", "No such file"),
+        ("--json", "", "Is a directory"),
+        ("--csv", "poses.txt", ".csv"),
+    ],
+)
 def test_output_paths_are_checked_before_the_network_is_loaded(
     refused, folder, intrinsics, option, name, message, tmp_path, monkeypatch
 ):
@@ -145,15 +155,18 @@ def test_output_paths_are_checked_before_the_network_is_loaded(
     assert message in refused("predict", RELEASED, *words)
 
 
-@pytest.mark.parametrize(("name", "camera", "silent"), [
-    ("grey.png", (554, 416, 319.5, 239.5), False),
-    ("empty.png", (554, 416, 319.5, 239.5), True),
-    ("corner.png", (554, 416, 99.5, 39.5), False),
-    ("4k.png", (3326, 1871, 1919.5, 1079.5), False),
-    ("dot.png", (1, 1, 0, 0), True),
-    ("whole.png", (1108, 832, 319.5, 239.5), False),
-    ("whole.png", (277, 208, 319.5, 239.5), False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "camera", "silent"),
+    [
+        ("grey.png", (554, 416, 319.5, 239.5), False),
+        ("empty.png", (554, 416, 319.5, 239.5), True),
+        ("corner.png", (554, 416, 99.5, 39.5), False),
+        ("4k.png", (3326, 1871, 1919.5, 1079.5), False),
+        ("dot.png", (1, 1, 0, 0), True),
+        ("whole.png", (1108, 832, 319.5, 239.5), False),
+        ("whole.png", (277, 208, 319.5, 239.5), False),
+    ],
+)
 def test_every_image_has_poses_or_a_reason_in_time(run, folder, name, camera, silent):
     """Refine the poses; ``silent`` means that the image shows no part."""
     start = time.process_time()

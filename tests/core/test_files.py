@@ -59,14 +59,17 @@ def test_the_suffix_determines_the_format_of_an_image(name, head, tmp_path):
     assert np.abs(back.astype(int) - (200, 100, 50)).max() < 4
 
 
-@pytest.mark.parametrize(("name", "message"), [
-    ("a.gif", r"suffixes \.png, \.jpg, \.jpeg"),
-    ("a", "to write; allowed"),
-    (".", "which is a folder; allowed"),
-    ("folder.png", "Is a directory"),
-    ("file/a.png", "File exists|Not a directory"),
-    ("/proc/none/a.png", "No such file"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.gif", r"suffixes \.png, \.jpg, \.jpeg"),
+        ("a", "to write; allowed"),
+        (".", "which is a folder; allowed"),
+        ("folder.png", "Is a directory"),
+        ("file/a.png", "File exists|Not a directory"),
+        ("/proc/none/a.png", "No such file"),
+    ],
+)
 def test_an_unwritable_target_is_refused(name, message, tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()

@@ -129,14 +129,20 @@ def test_a_server_that_resumes_at_another_byte_is_rejected(get, tmp_path):
         get("wrong-range")
 
 
-@pytest.mark.parametrize(("kind", "message"), [
-    ("other", f"a file with SHA-256 [0-9a-f]{{64}}; allowed: {SHA256}; fix: run the command again"),
-    ("longer", "3000001 bytes; allowed: 3000000 bytes"),
-    ("endless", "more than 3000000 bytes; allowed: 3000000 bytes"),
-    ("gone", "the server answers 404 Not Found"),
-    ("redirect:file:///etc/passwd", "302 .*file:///etc/passwd"),
-    ("redirect:ftp://127.0.0.1/x", "unknown url type: ftp"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (
+            "other",
+            f"a file with SHA-256 [0-9a-f]{{64}}; allowed: {SHA256}; fix: run the command again",
+        ),
+        ("longer", "3000001 bytes; allowed: 3000000 bytes"),
+        ("endless", "more than 3000000 bytes; allowed: 3000000 bytes"),
+        ("gone", "the server answers 404 Not Found"),
+        ("redirect:file:///etc/passwd", "302 .*file:///etc/passwd"),
+        ("redirect:ftp://127.0.0.1/x", "unknown url type: ftp"),
+    ],
+)
 def test_a_wrong_file_is_rejected_and_deleted(get, tmp_path, kind, message):
     with pytest.raises(UserError, match=message) as caught:
         get(kind)

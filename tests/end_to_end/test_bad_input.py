@@ -73,11 +73,14 @@ def hostile_pickle(path: Path) -> None:
     torch.save({"state_dict": Command(), "dopepp": {}}, path)
 
 
-@pytest.mark.parametrize(("write", "place", "expected"), [
-    (hostile_pickle, "ckpt_path", "which torch cannot load"),
-    (hostile_pickle, "init_from", "which torch cannot load"),
-    (lambda path: None, "baseline", "which is not a file"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("write", "place", "expected"),
+    [
+        (hostile_pickle, "ckpt_path", "which torch cannot load"),
+        (hostile_pickle, "init_from", "which torch cannot load"),
+        (lambda path: None, "baseline", "which is not a file"),
+    ],
+)
 def test_a_file_that_is_no_checkpoint(write, place, expected, trained, call, train, tmp_path):
     good, bad = trained[0] / "checkpoints" / "best.ckpt", tmp_path / "bad.ckpt"
     write(bad)

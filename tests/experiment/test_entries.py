@@ -53,14 +53,17 @@ def test_a_rejected_run_keeps_existing_files(call, tiny_options, tmp_path):
     assert (tmp_path / "mine.txt").is_file()
 
 
-@pytest.mark.parametrize(("words", "incomplete", "expected"), [
-    ([], "model=dopepp_", ["model=dopepp_fast"]),
-    (["model", "="], "dopepp_", ["dopepp_fast"]),  # as bash splits it
-    ([], "recip", ["recipe=ours", "recipe=paper"]),
-    (["recipe=paper"], "trainer.max_ep", ["trainer.max_epochs=60"]),
-    ([], "virtual.scene.sensors.noise", ["virtual.scene.sensors.noise_probability=0.5"]),
-    (["virtual.preset=wide"], "virtual.scene.hor", ["virtual.scene.horizontal_fov_deg=60.0"]),
-    ([], "no_such", []),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "incomplete", "expected"),
+    [
+        ([], "model=dopepp_", ["model=dopepp_fast"]),
+        (["model", "="], "dopepp_", ["dopepp_fast"]),  # as bash splits it
+        ([], "recip", ["recipe=ours", "recipe=paper"]),
+        (["recipe=paper"], "trainer.max_ep", ["trainer.max_epochs=60"]),
+        ([], "virtual.scene.sensors.noise", ["virtual.scene.sensors.noise_probability=0.5"]),
+        (["virtual.preset=wide"], "virtual.scene.hor", ["virtual.scene.horizontal_fov_deg=60.0"]),
+        ([], "no_such", []),
+    ],
+)
 def test_the_shell_completes_overrides(words, incomplete, expected):
     assert complete("train", words, incomplete) == expected

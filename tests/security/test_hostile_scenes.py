@@ -266,13 +266,16 @@ def test_hostile_scenes(name, tmp_path):
         read_mesh(path, "mm")
 
 
-@pytest.mark.parametrize(("name", "content"), [
-    ("a.glb", glb()),
-    ("b.glb", glb(nodes=NODES)),
-    ("a.3mf", one_model(body(1))),
-    ("b.3mf", one_model(body(1) + assembly(2, *[1] * 30), '<item objectid="2"/>')),
-    ("a.off", TRIANGLE_OFF),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.glb", glb()),
+        ("b.glb", glb(nodes=NODES)),
+        ("a.3mf", one_model(body(1))),
+        ("b.3mf", one_model(body(1) + assembly(2, *[1] * 30), '<item objectid="2"/>')),
+        ("a.off", TRIANGLE_OFF),
+    ],
+)
 def test_the_undamaged_scenes_are_read(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     with bounded():

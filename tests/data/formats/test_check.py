@@ -660,14 +660,24 @@ SCENE_FILE = "train_pbr/000000/scene_gt.json"
 NDDS_FILES = ("000000.json", "000000.png", "_object_settings.json")
 
 
-@pytest.mark.parametrize(("names", "found"), [
-    ([f"bracket/{SCENE_FILE}", *(f"plate/{name}" for name in NDDS_FILES)],
-     r"2 data sets: bracket \(BOP\), plate \(NDDS\)"),
-    ([f"bracket/{SCENE_FILE}"], r"1 data sets: bracket \(BOP\)"),
-    ([f"{item}/{name}" for item in "ab" for name in (*NDDS_FILES, RECORD_FILE)],
-     r"2 data sets: a \(NDDS\), b \(NDDS\)"),
-    ([f"set{n}/{SCENE_FILE}" for n in range(10)], r"10 data sets: set0 .*set7 \(BOP\) and 2 more"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (
+            [f"bracket/{SCENE_FILE}", *(f"plate/{name}" for name in NDDS_FILES)],
+            r"2 data sets: bracket \(BOP\), plate \(NDDS\)",
+        ),
+        ([f"bracket/{SCENE_FILE}"], r"1 data sets: bracket \(BOP\)"),
+        (
+            [f"{item}/{name}" for item in "ab" for name in (*NDDS_FILES, RECORD_FILE)],
+            r"2 data sets: a \(NDDS\), b \(NDDS\)",
+        ),
+        (
+            [f"set{n}/{SCENE_FILE}" for n in range(10)],
+            r"10 data sets: set0 .*set7 \(BOP\) and 2 more",
+        ),
+    ],
+)
 def test_a_folder_of_data_sets_is_rejected(names, found, tmp_path):
     make(tmp_path, *names)
     first = min(name.split("/")[0] for name in names)

@@ -247,15 +247,18 @@ def test_a_part_can_be_given_a_name(tmp_path):
         named_part("left=/nowhere/x.stl", "mm")
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    (["lighting"], "allowed: FIELD.FIELD=VALUE"),
-    (["lighting.=1"], "allowed: FIELD.FIELD=VALUE"),
-    (["lighting.tint=["], "allowed: FIELD.FIELD=VALUE"),
-    (["lighting.tint=0.1", "lighting.tint=0.2"], "after another --set"),
-    (["lighting.tint=0.1", "lighting=1"], "after another --set"),
-    (["width=64", "width.x=1"], "after another --set"),
-    (["lighting.tint=blue"], "lighting.tint='blue'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["lighting"], "allowed: FIELD.FIELD=VALUE"),
+        (["lighting.=1"], "allowed: FIELD.FIELD=VALUE"),
+        (["lighting.tint=["], "allowed: FIELD.FIELD=VALUE"),
+        (["lighting.tint=0.1", "lighting.tint=0.2"], "after another --set"),
+        (["lighting.tint=0.1", "lighting=1"], "after another --set"),
+        (["width=64", "width.x=1"], "after another --set"),
+        (["lighting.tint=blue"], "lighting.tint='blue'"),
+    ],
+)
 def test_invalid_changes_are_rejected(changes, message):
     with pytest.raises(UserError, match=message):
         make_job(["servoholder"], changes=changes)

@@ -112,18 +112,24 @@ def test_on_a_table(my_part):
     assert sample.size == data.network_input
 
 
-@pytest.mark.parametrize(("distance", "overrides", "got"), [
-    ("[0.8,0.3]", (), "working_distance=[0.8, 0.3]"),
-    ("[0.05,0.3]", (), "working_distance from 0.05 m, where pivconnector (108 mm across)"),
-    ("[0.4,20]", (), "working_distance to 20 m, where pivconnector"),
-    ("null", (), "camera without working_distance"),
-    ("[0.4]", (), "working_distance=[0.4]"),
-    ("[0.4,0.7]", ("virtual.camera=null",), "working_distance without camera"),
-    ("[0.4,0.7]", ("virtual.camera=/nowhere.yaml",), "camera file /nowhere.yaml"),
-    ("[0.4,0.7]", ("virtual.camera_scale=1.0", "data.input_size=[128,128]"),
-     "data.input_size=[128, 128] for parts 253 pixels across"),
-    ("[0.4,0.7]", ("virtual.camera_scale=0.1",), "working_distance to 0.7 m, where"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("distance", "overrides", "got"),
+    [
+        ("[0.8,0.3]", (), "working_distance=[0.8, 0.3]"),
+        ("[0.05,0.3]", (), "working_distance from 0.05 m, where pivconnector (108 mm across)"),
+        ("[0.4,20]", (), "working_distance to 20 m, where pivconnector"),
+        ("null", (), "camera without working_distance"),
+        ("[0.4]", (), "working_distance=[0.4]"),
+        ("[0.4,0.7]", ("virtual.camera=null",), "working_distance without camera"),
+        ("[0.4,0.7]", ("virtual.camera=/nowhere.yaml",), "camera file /nowhere.yaml"),
+        (
+            "[0.4,0.7]",
+            ("virtual.camera_scale=1.0", "data.input_size=[128,128]"),
+            "data.input_size=[128, 128] for parts 253 pixels across",
+        ),
+        ("[0.4,0.7]", ("virtual.camera_scale=0.1",), "working_distance to 0.7 m, where"),
+    ],
+)
 def test_a_mistake_is_one_line(distance, overrides, got, my_part):
     with pytest.raises(UserError) as error:
         my_part(*overrides, distance=distance)

@@ -123,22 +123,25 @@ def test_a_users_mesh_with_its_unit(tiny, tmp_path):
     assert sample.instances[0].mask.any()
 
 
-@pytest.mark.parametrize(("override", "got"), [
-    ("data.parts=[gear]", "unknown part 'gear'"),
-    ("data.parts=[gear.stl]", "gear.stl, no such file"),
-    ("data.parts=[]", "parts []"),
-    ("data.parts=[pivconnector,pivconnector]", "pivconnector"),
-    ("data.objects=[003_cracker_box]", "without data.root"),
-    ("data.frames=[0050/000003]", "without data.root"),
-    ("data=ycb_video", "data=ycb_video without data.root"),
-    ("data.root=/nowhere", "data.root=/nowhere, which is not a folder"),
-    ("data.batch_size=9", "8 training images for batches of 9"),
-    ("virtual.preset=moon", "preset 'moon'"),
-    ("++virtual.scene.gravity=1", "virtual.scene.gravity=1"),
-    ("++virtual.scene.turning=free", "virtual.scene.turning='free'"),
-    ("virtual.backgrounds=/nowhere", "/nowhere"),
-    ("data.masking.probability=2", "probability"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("override", "got"),
+    [
+        ("data.parts=[gear]", "unknown part 'gear'"),
+        ("data.parts=[gear.stl]", "gear.stl, no such file"),
+        ("data.parts=[]", "parts []"),
+        ("data.parts=[pivconnector,pivconnector]", "pivconnector"),
+        ("data.objects=[003_cracker_box]", "without data.root"),
+        ("data.frames=[0050/000003]", "without data.root"),
+        ("data=ycb_video", "data=ycb_video without data.root"),
+        ("data.root=/nowhere", "data.root=/nowhere, which is not a folder"),
+        ("data.batch_size=9", "8 training images for batches of 9"),
+        ("virtual.preset=moon", "preset 'moon'"),
+        ("++virtual.scene.gravity=1", "virtual.scene.gravity=1"),
+        ("++virtual.scene.turning=free", "virtual.scene.turning='free'"),
+        ("virtual.backgrounds=/nowhere", "/nowhere"),
+        ("data.masking.probability=2", "probability"),
+    ],
+)
 def test_a_mistake_in_the_data_is_one_line(override, got, tiny):
     with pytest.raises(UserError) as error:
         counts(tiny(override).data)
@@ -161,19 +164,28 @@ def test_preset_changes_reach_the_renders(tiny):
     assert fx[0] < fx[1]
 
 
-@pytest.mark.parametrize(("overrides", "words"), [
-    (("data=bop",), "the last 10% of the images in train_pbr, which is shared with "
-     "train and val; data.image_sets.train=none data.image_sets.val=none measures"),
-    (("data=bop", "data.image_sets.val=other"), "the last 20% of the images in train_pbr, "
-     "which is shared with train; data.image_sets.train=none measures"),
-    (("data=ndds",), "the last 10% of the images in ., which"),
-    (("data=bop", "data.image_sets.test=test"), None),
-    (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
-    (("data=bop", "data/test=photoreal"), None),
-    (("data=ycb_video",), None),
-    (("data=ndds", "data.format=posed"), None),
-    (("data=virtual",), None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (
+            ("data=bop",),
+            "the last 10% of the images in train_pbr, which is shared with "
+            "train and val; data.image_sets.train=none data.image_sets.val=none measures",
+        ),
+        (
+            ("data=bop", "data.image_sets.val=other"),
+            "the last 20% of the images in train_pbr, "
+            "which is shared with train; data.image_sets.train=none measures",
+        ),
+        (("data=ndds",), "the last 10% of the images in ., which"),
+        (("data=bop", "data.image_sets.test=test"), None),
+        (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
+        (("data=bop", "data/test=photoreal"), None),
+        (("data=ycb_video",), None),
+        (("data=ndds", "data.format=posed"), None),
+        (("data=virtual",), None),
+    ],
+)
 def test_a_shared_folder_is_reported_with_overrides_that_change_the_share(overrides, words, tiny):
     root = () if "data=virtual" in overrides else ("data.root=somewhere",)
     note = note_on_shared_folder(tiny(*overrides, *root).data)

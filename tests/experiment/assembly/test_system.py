@@ -15,17 +15,20 @@ from dopepp.experiment.assembly.build_system import (
 from dopepp.experiment.config.run_config import TrainerConfig
 
 
-@pytest.mark.parametrize(("accelerator", "vendor", "flags", "gpu_is_fast", "expected"), [
-    ("cpu", "AuthenticAMD", "sse2 avx512_bf16", False, "bf16-mixed"),
-    ("cpu", "GenuineIntel", "sse2 avx512_bf16", False, "32-true"),
-    ("cpu", "GenuineIntel", "sse2 avx512_bf16 amx_bf16", False, "bf16-mixed"),
-    ("cpu", "", "asimd bf16", False, "bf16-mixed"),
-    ("cpu", "AuthenticAMD", "sse2 avx2", True, "32-true"),
-    ("cpu", "", "", True, "32-true"),
-    ("cuda", "", "", True, "bf16-mixed"),
-    ("cuda", "AuthenticAMD", "avx512_bf16", False, "32-true"),
-    ("mps", "AuthenticAMD", "avx512_bf16", True, "32-true"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("accelerator", "vendor", "flags", "gpu_is_fast", "expected"),
+    [
+        ("cpu", "AuthenticAMD", "sse2 avx512_bf16", False, "bf16-mixed"),
+        ("cpu", "GenuineIntel", "sse2 avx512_bf16", False, "32-true"),
+        ("cpu", "GenuineIntel", "sse2 avx512_bf16 amx_bf16", False, "bf16-mixed"),
+        ("cpu", "", "asimd bf16", False, "bf16-mixed"),
+        ("cpu", "AuthenticAMD", "sse2 avx2", True, "32-true"),
+        ("cpu", "", "", True, "32-true"),
+        ("cuda", "", "", True, "bf16-mixed"),
+        ("cuda", "AuthenticAMD", "avx512_bf16", False, "32-true"),
+        ("mps", "AuthenticAMD", "avx512_bf16", True, "32-true"),
+    ],
+)
 def test_bf16_needs_fast_hardware(accelerator, vendor, flags, gpu_is_fast, expected, monkeypatch):
     facts = {("vendor_id",): vendor, ("flags", "Features"): flags}
     monkeypatch.setattr(built, "cpu_fact", lambda *names: facts[names])

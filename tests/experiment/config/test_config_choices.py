@@ -96,10 +96,14 @@ def test_every_choice_composes(group, name, composed):
             assert node[key] == value
 
 
-@pytest.mark.parametrize("choice", [
-    f"{group}={name}" for group, name in CHOICES
-    if group in ("model", "model/backbone", "model/attention", "model/head", "model/loss")
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "choice",
+    [
+        f"{group}={name}"
+        for group, name in CHOICES
+        if group in ("model", "model/backbone", "model/attention", "model/head", "model/loss")
+    ],
+)
 def test_every_model_choice_trains_one_step(choice, tiny):
     config = tiny(choice, "data.parts=[pivconnector,servoholder]")
     system = build_system(config, build_parts(config.data), "")

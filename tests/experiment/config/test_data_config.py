@@ -62,22 +62,28 @@ def test_a_whole_data_node_keeps_only_the_stored_render_options(evaluated, store
     assert evaluated(None, "data=bop", "data.root=x").virtual.preset is None
 
 
-@pytest.mark.parametrize(("override", "message"), [
-    ("++data.num_tests=5", r"data\.num_tests=5.*num_test"),
-    ("++data.num_test=many", r"best\.ckpt.*data\.num_test='many'"),
-    ("++data.masking.share=1", r"data\.masking\.share=1"),
-    ("++virtual.presets=bin", r"virtual\.presets='bin'; allowed: preset"),
-    ("++data.virtual.preset=bin", r"data\.virtual=.*"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("++data.num_tests=5", r"data\.num_tests=5.*num_test"),
+        ("++data.num_test=many", r"best\.ckpt.*data\.num_test='many'"),
+        ("++data.masking.share=1", r"data\.masking\.share=1"),
+        ("++virtual.presets=bin", r"virtual\.presets='bin'; allowed: preset"),
+        ("++data.virtual.preset=bin", r"data\.virtual=.*"),
+    ],
+)
 def test_unknown_options_are_named(override, message, evaluated, stored):
     with pytest.raises(UserError, match=message):
         evaluated(stored, override)
 
 
-@pytest.mark.parametrize(("override", "message"), [
-    ("++data.num_test=5", r"best\.ckpt, which contains no data config"),
-    ("data=virtual", r"best\.ckpt, which contains no options of the renders"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("++data.num_test=5", r"best\.ckpt, which contains no data config"),
+        ("data=virtual", r"best\.ckpt, which contains no options of the renders"),
+    ],
+)
 def test_a_checkpoint_without_a_data_config_is_rejected(override, message, evaluated):
     with pytest.raises(UserError, match=message):
         evaluated(None, override)
@@ -114,12 +120,15 @@ def test_seen_on_selects_preset_and_rotations(seen_on, preset, turning, parsed):
     assert (scenes.table is not None) == (preset != "wide")
 
 
-@pytest.mark.parametrize(("materials", "changes"), [
-    ("mixed", {}),
-    ("metal", {"metal_share": 0.8, "metal_roughness": (0.1, 0.5)}),
-    ("plastic", {"metal_share": 0.0, "print_share": 0.0}),
-    ("print", {"metal_share": 0.0, "print_share": 1.0}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("materials", "changes"),
+    [
+        ("mixed", {}),
+        ("metal", {"metal_share": 0.8, "metal_roughness": (0.1, 0.5)}),
+        ("plastic", {"metal_share": 0.0, "print_share": 0.0}),
+        ("print", {"metal_share": 0.0, "print_share": 1.0}),
+    ],
+)
 @pytest.mark.parametrize("seen_on", ["front", "bin"])
 def test_materials_change_surfaces_and_metals_see_panels(seen_on, materials, changes, parsed):
     options = ("experiment=my_part", f"seen_on={seen_on}")

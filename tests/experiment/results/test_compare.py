@@ -195,13 +195,16 @@ def test_evaluations_are_grouped_by_the_training_of_a_checkpoint(tmp_path):
     assert len(group(find_runs([*evaluations, tmp_path / "run1"]))) == 2
 
 
-@pytest.mark.parametrize(("file", "content", "reason"), [
-    (METRICS_FILE, "{", "cannot be read"),
-    (METRICS_FILE, "{}", "metrics.json is of another version"),
-    (METRICS_FILE, '{"name": 1, "objects": []}', "of another version"),
-    (COST_FILE, "{}", "cost.json is of another version"),
-    ("checkpoints/last.ckpt", "", "no metrics.json; continue with resume="),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("file", "content", "reason"),
+    [
+        (METRICS_FILE, "{", "cannot be read"),
+        (METRICS_FILE, "{}", "metrics.json is of another version"),
+        (METRICS_FILE, '{"name": 1, "objects": []}', "of another version"),
+        (COST_FILE, "{}", "cost.json is of another version"),
+        ("checkpoints/last.ckpt", "", "no metrics.json; continue with resume="),
+    ],
+)
 def test_damaged_or_unfinished_runs_state_the_reason(file, content, reason, tmp_path):
     run = write_run(tmp_path / "0")
     assert read_run(run).failure == "unfinished: no metrics.json"

@@ -139,9 +139,16 @@ def test_nothing_but_failures(compare_golden):
 # The paper's tables
 
 
-@pytest.mark.parametrize("experiment", [
-    "table1_real_hybrid", "table2_mask", "table5_attention", "table6_dope_vs_dopepp", "table7_ycbv",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "experiment",
+    [
+        "table1_real_hybrid",
+        "table2_mask",
+        "table5_attention",
+        "table6_dope_vs_dopepp",
+        "table7_ycbv",
+    ],
+)
 def test_paper_tables_of_poses(experiment, compare_golden):
     table, rng = table_of(experiment), np.random.default_rng(1)
     parts = sorted({part for row in table["paper"].values() for part in row} - {MEAN}) or ["part"]

@@ -110,12 +110,15 @@ def test_recipe_of_experiments(composed):
     assert table["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
 
 
-@pytest.mark.parametrize(("table", "message"), [
-    ({"title": "T", "colour": 1}, r"table\.colour=1; allowed: title, kind"),
-    ({"title": "T", "kind": "pie"}, r"table\.kind='pie'; allowed: poses, shading"),
-    ({"title": "T", "threshold": 0.2}, r"table\.threshold=0\.2; allowed: 0\.05, 0\.1"),
-    ({}, "no table.title"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"title": "T", "colour": 1}, r"table\.colour=1; allowed: title, kind"),
+        ({"title": "T", "kind": "pie"}, r"table\.kind='pie'; allowed: poses, shading"),
+        ({"title": "T", "threshold": 0.2}, r"table\.threshold=0\.2; allowed: 0\.05, 0\.1"),
+        ({}, "no table.title"),
+    ],
+)
 def test_impossible_tables(table, message):
     with pytest.raises(UserError, match=message):
         PaperTable.of(table)

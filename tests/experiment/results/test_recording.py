@@ -118,14 +118,17 @@ def test_a_results_file_of_other_data_is_rejected(root, results_of, tmp_path):
         results_of(tmp_path / "results.csv", poses=poses)
 
 
-@pytest.mark.parametrize(("source", "key", "expected"), [
-    ("bop/test", "000048/000017", (48, 17)),
-    ("webdataset/shards", "000048_000017", (48, 17)),
-    ("ycb_video/data", "0050/000003", (50, 3)),
-    ("virtual", "test/0/12", (0, 5)),
-    ("ndds/folder", "12/000034", (0, 5)),
-    ("webdataset/shards", "photo-7", (0, 5)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("source", "key", "expected"),
+    [
+        ("bop/test", "000048/000017", (48, 17)),
+        ("webdataset/shards", "000048_000017", (48, 17)),
+        ("ycb_video/data", "0050/000003", (50, 3)),
+        ("virtual", "test/0/12", (0, 5)),
+        ("ndds/folder", "12/000034", (0, 5)),
+        ("webdataset/shards", "photo-7", (0, 5)),
+    ],
+)
 def test_images_have_bops_numbers_or_their_place(source, key, expected):
     sample = Sample(np.zeros((1, 1, 3), np.uint8), np.eye(3), source=source, key=key)
     assert image_id(sample, 5) == expected

@@ -116,17 +116,20 @@ def test_detections_on_images_without_the_part_are_counted(evaluate, tmp_path, c
     assert "## Images without the part\n\n| method |" in (run / "README.md").read_text()
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ("ckpt_path=x negatives_camera=y", "negatives_camera=y without negatives"),
-    ("results=x negatives=y", "negatives=y without ckpt_path"),
-    ("ckpt_path=x scale_error=0.01", "scale_error=0.01 without refine"),
-    ("ckpt_path=x refine=region scale_error=0.2", "scale_error=0.2"),
-    ("ckpt_path=x tune=true negatives=y", "tune=true with shading, scale, by, neg"),
-    ("", "got nothing to evaluate; allowed: one or more of ckpt_path=…"),
-    ("results=x.csv", r"x\.csv, which contains no data config; .*data=…"),
-    ("results=x.csv data=virtual", r"x\.csv, which contains no options of the renders"),
-    ("results=x.csv refine=region", "got refine=region without ckpt_path; .*leave out refine"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("ckpt_path=x negatives_camera=y", "negatives_camera=y without negatives"),
+        ("results=x negatives=y", "negatives=y without ckpt_path"),
+        ("ckpt_path=x scale_error=0.01", "scale_error=0.01 without refine"),
+        ("ckpt_path=x refine=region scale_error=0.2", "scale_error=0.2"),
+        ("ckpt_path=x tune=true negatives=y", "tune=true with shading, scale, by, neg"),
+        ("", "got nothing to evaluate; allowed: one or more of ckpt_path=…"),
+        ("results=x.csv", r"x\.csv, which contains no data config; .*data=…"),
+        ("results=x.csv data=virtual", r"x\.csv, which contains no options of the renders"),
+        ("results=x.csv refine=region", "got refine=region without ckpt_path; .*leave out refine"),
+    ],
+)
 def test_impossible_combinations_of_options(options, message, evaluate, tmp_path):
     with pytest.raises(UserError, match=message):
         evaluate(*options.split())

@@ -61,16 +61,19 @@ def test_a_full_disk_keeps_the_old_file(monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == [old]
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"layout": "torchscript"}, "--format torchscript; allowed: onnx, openvino, safetensors"),
-    ({"precision": "bf16"}, "--precision bf16; allowed: fp32, fp16, int8"),
-    ({"layout": "safetensors", "precision": "int8"}, "allowed: fp32 or fp16"),
-    ({"out": Path("a.pt")}, r"--out a\.pt for --format onnx; allowed: a file NAME\.onnx"),
-    ({"layout": "openvino", "out": Path("a.xml")}, "allowed: a folder"),
-    ({"layout": "openvino", "out": Path("full")}, "which exists and is not an export"),
-    ({"path": Path("a.onnx")}, "which is an export; allowed: a checkpoint"),
-    ({"path": Path("none.ckpt")}, "which is not a file"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"layout": "torchscript"}, "--format torchscript; allowed: onnx, openvino, safetensors"),
+        ({"precision": "bf16"}, "--precision bf16; allowed: fp32, fp16, int8"),
+        ({"layout": "safetensors", "precision": "int8"}, "allowed: fp32 or fp16"),
+        ({"out": Path("a.pt")}, r"--out a\.pt for --format onnx; allowed: a file NAME\.onnx"),
+        ({"layout": "openvino", "out": Path("a.xml")}, "allowed: a folder"),
+        ({"layout": "openvino", "out": Path("full")}, "which exists and is not an export"),
+        ({"path": Path("a.onnx")}, "which is an export; allowed: a checkpoint"),
+        ({"path": Path("none.ckpt")}, "which is not a file"),
+    ],
+)
 def test_wrong_options(options, message, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "validation_renders", None)  # which takes a minute
     (tmp_path / "full").mkdir()

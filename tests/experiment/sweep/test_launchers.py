@@ -46,11 +46,20 @@ def check_two_done_and_one_failed(folder: Path, out: str, err: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("package", "options"), [
-    ("joblib", ["hydra/launcher=joblib"]),
-    ("submitit", ["hydra/launcher=submitit_slurm", "hydra.launcher.cluster=local",
-                  "hydra.launcher.gpus_per_node=0"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("package", "options"),
+    [
+        ("joblib", ["hydra/launcher=joblib"]),
+        (
+            "submitit",
+            [
+                "hydra/launcher=submitit_slurm",
+                "hydra.launcher.cluster=local",
+                "hydra.launcher.gpus_per_node=0",
+            ],
+        ),
+    ],
+)
 def test_processes_of_this_machine(package, options, sweep, tmp_path):
     pytest.importorskip(package)
     code, out, err = sweep(*options, SWEPT, END_1="raise")
@@ -190,13 +199,16 @@ def test_a_requeued_job_resumes_the_run_of_its_command(slurm_job, tmp_path, monk
     assert multirun.requeued_run(["seed=1"]) is None
 
 
-@pytest.mark.parametrize(("variables", "named"), [
-    ({}, "12"),
-    ({"SLURM_ARRAY_JOB_ID": "10", "SLURM_ARRAY_TASK_ID": "3"}, "10_3"),  # as scontrol does
-    ({"SLURM_JOB_ID": ""}, None),
-    ({"SLURM_JOB_ID": "1; rm"}, None),
-    ({"SLURM_JOB_ID": "--help"}, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("variables", "named"),
+    [
+        ({}, "12"),
+        ({"SLURM_ARRAY_JOB_ID": "10", "SLURM_ARRAY_TASK_ID": "3"}, "10_3"),  # as scontrol does
+        ({"SLURM_JOB_ID": ""}, None),
+        ({"SLURM_JOB_ID": "1; rm"}, None),
+        ({"SLURM_JOB_ID": "--help"}, None),
+    ],
+)
 def test_slurm_job_ids(variables, named, slurm_job, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)

@@ -23,19 +23,22 @@ def loader():
     return ConfigLoaderImpl(create_config_search_path(None))
 
 
-@pytest.mark.parametrize(("text", "expected"), [
-    ("interval(0, 1)", FloatDistribution(0, 1)),
-    ("interval(1e-4, 0.5)", FloatDistribution(1e-4, 0.5)),
-    ("tag(log, interval(1e-4, 1))", FloatDistribution(1e-4, 1, log=True)),
-    ("int(interval(8, 64))", IntDistribution(8, 64)),
-    ("tag(log, int(interval(8, 64)))", IntDistribution(8, 64, log=True)),
-    ("range(1, 10, 4)", IntDistribution(1, 9, step=4)),
-    ("range(3)", IntDistribution(0, 2)),
-    ("range(9, 0, -3)", IntDistribution(3, 9, step=3)),
-    ("range(0.0, 0.5, 0.25)", CategoricalDistribution(["0.0", "0.25"])),
-    ("choice(a, 3, true)", CategoricalDistribution(["a", "3", "True"])),
-    ("a,b", CategoricalDistribution(["a", "b"])),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("interval(0, 1)", FloatDistribution(0, 1)),
+        ("interval(1e-4, 0.5)", FloatDistribution(1e-4, 0.5)),
+        ("tag(log, interval(1e-4, 1))", FloatDistribution(1e-4, 1, log=True)),
+        ("int(interval(8, 64))", IntDistribution(8, 64)),
+        ("tag(log, int(interval(8, 64)))", IntDistribution(8, 64, log=True)),
+        ("range(1, 10, 4)", IntDistribution(1, 9, step=4)),
+        ("range(3)", IntDistribution(0, 2)),
+        ("range(9, 0, -3)", IntDistribution(3, 9, step=3)),
+        ("range(0.0, 0.5, 0.25)", CategoricalDistribution(["0.0", "0.25"])),
+        ("choice(a, 3, true)", CategoricalDistribution(["a", "3", "True"])),
+        ("a,b", CategoricalDistribution(["a", "b"])),
+    ],
+)
 def test_sweeps_become_distributions(text, expected, loader):
     space = read_space(loader, [f"x.y={text}"], [])
     assert (space.varied, space.texts) == ({"x.y": expected}, {"x.y": text})
@@ -178,18 +181,21 @@ def test_a_folder_of_another_study_or_command_is_rejected(call_fast, tmp_path):
         assert "search.study=s, which another command is searching" in call_fast(*FAST).line
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["search.num_trials=0"], "search.num_trials=0"),
-    (["search.num_parallel=x"], "search.num_parallel='x'"),
-    (["experiment=table6_dope_vs_dopepp"], "already sweeps over model, data.parts"),
-    (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
-    (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
-    (["search.space=['optimizer.lr=1']"], "which is a single value"),
-    (["search.space=[]", "optimizer.lr=1"], "no option to vary"),
-    (["model/attention=choice(cbam,cbbm)"], "cbbm"),
-    (["search.storage=/dev/null/study.db"], "search.storage=/dev/null/study.db"),
-    (["search.storage=nowhere://x"], "search.storage=nowhere://x"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["search.num_trials=0"], "search.num_trials=0"),
+        (["search.num_parallel=x"], "search.num_parallel='x'"),
+        (["experiment=table6_dope_vs_dopepp"], "already sweeps over model, data.parts"),
+        (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
+        (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
+        (["search.space=['optimizer.lr=1']"], "which is a single value"),
+        (["search.space=[]", "optimizer.lr=1"], "no option to vary"),
+        (["model/attention=choice(cbam,cbbm)"], "cbbm"),
+        (["search.storage=/dev/null/study.db"], "search.storage=/dev/null/study.db"),
+        (["search.storage=nowhere://x"], "search.storage=nowhere://x"),
+    ],
+)
 def test_mistakes_are_reported_in_one_line(arguments, message, call_fast, tmp_path):
     assert message in call_fast("search=optuna", "search.study=s", *arguments).line
     assert not (tmp_path / "search" / "s" / "started.txt").exists()

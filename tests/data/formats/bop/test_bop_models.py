@@ -126,24 +126,30 @@ def test_objects_without_a_name_are_named_after_their_file(tmp_path):
         bop_parts(tmp_path / "none")
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    *(({"1": record}, message) for record, message in [
-        ({"diameter": -1}, r"1\.diameter: -1"),
-        ({"diameter": "3"}, r"1\.diameter: '3'.*1 finite number"),
-        ({"name": ""}, "printable characters"),
-        ({"name": ["a"]}, "part name"),
-        ({"symmetries_discrete": [[1] * 15]}, r"symmetries_discrete\[0\]: .*4×4 finite"),
-        ({"symmetries_discrete": [[2.0] * 16]}, r"symmetries_discrete\[0\]: .*rigid"),
-        ({"symmetries_discrete": 3}, "symmetries_discrete: 3; .*a list of at most"),
-        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0] * 3}]}, "axis other"),
-        ({"symmetries_continuous": [{"axis": [0, 0, 1]}]}, "3 finite numbers"),
-        ([], r"1: \[\]; .*diameter and symmetries"),
-    ]),
-    ({"1": {}, "01": {}}, "'01': not an object number, or a repeated number"),
-    ({"1": {"name": "a"}, "2": {"name": "a"}}, r"2\.name: 'a' twice"),
-    ({"a": {}}, "objects by number"),
-    ([], "objects by number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        *(
+            ({"1": record}, message)
+            for record, message in [
+                ({"diameter": -1}, r"1\.diameter: -1"),
+                ({"diameter": "3"}, r"1\.diameter: '3'.*1 finite number"),
+                ({"name": ""}, "printable characters"),
+                ({"name": ["a"]}, "part name"),
+                ({"symmetries_discrete": [[1] * 15]}, r"symmetries_discrete\[0\]: .*4×4 finite"),
+                ({"symmetries_discrete": [[2.0] * 16]}, r"symmetries_discrete\[0\]: .*rigid"),
+                ({"symmetries_discrete": 3}, "symmetries_discrete: 3; .*a list of at most"),
+                ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0] * 3}]}, "axis other"),
+                ({"symmetries_continuous": [{"axis": [0, 0, 1]}]}, "3 finite numbers"),
+                ([], r"1: \[\]; .*diameter and symmetries"),
+            ]
+        ),
+        ({"1": {}, "01": {}}, "'01': not an object number, or a repeated number"),
+        ({"1": {"name": "a"}, "2": {"name": "a"}}, r"2\.name: 'a' twice"),
+        ({"a": {}}, "objects by number"),
+        ([], "objects by number"),
+    ],
+)
 def test_damaged_models_info(content, message, tmp_path):
     (tmp_path / "models").mkdir()
     (tmp_path / INFO).write_text(json.dumps(content))

@@ -40,10 +40,15 @@ def test_a_file_in_the_toolkits_format(tmp_path):
     np.testing.assert_allclose(results[1].T_cam_obj[:3, 3], [0.1, -0.025, 0.9], atol=1e-15)
 
 
-@pytest.mark.parametrize("content", [
-    GOOD, f"{HEADER}\r\n{GOOD}\r\n", f"\ufeff{HEADER}\n\n{GOOD}\n\n",
-    f"scene_id, im_id, obj_id, score, R, t, time\n{GOOD.replace(',', ' , ')}",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        f"{HEADER}\r\n{GOOD}\r\n",
+        f"\ufeff{HEADER}\n\n{GOOD}\n\n",
+        f"scene_id, im_id, obj_id, score, R, t, time\n{GOOD.replace(',', ' , ')}",
+    ],
+)
 def test_header_blanks_and_line_ends_may_vary(content, tmp_path):
     (result,) = read_results(write(tmp_path, content), {2})
     assert (result.im_id, result.score, result.seconds) == (4, 0.75, 0.5)
@@ -65,35 +70,38 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
         assert vars(back) | {"T_cam_obj": 0} == vars(detection) | {"T_cam_obj": 0}
 
 
-@pytest.mark.parametrize(("line", "message"), [
-    ("1,4,2,0.75", r"line 2 with 4 fields; allowed: 7: scene_id,im_id"),
-    (GOOD + ",", r"line 2 with 8 fields"),
-    (GOOD.replace("1,4", "x,4", 1), r"line 2: scene_id 'x'; allowed: a whole number"),
-    (GOOD.replace("1,4", "-1,4", 1), r"line 2: scene_id '-1'"),
-    (GOOD.replace("1,4", "1,4.5", 1), r"line 2: im_id '4\.5'"),
-    (GOOD.replace("1,4", "1,99999999999", 1), r"line 2: im_id"),
-    (GOOD.replace(",2,", ",7,", 1), r"line 2: obj_id 7; allowed: the data set's objects: 2, 3"),
-    (GOOD.replace("0.75", "nan"), r"line 2: score: 'nan'; allowed: finite numbers"),
-    (GOOD.replace("0.75", "1e999"), r"line 2: score: '1e999'"),
-    (GOOD.replace("0.75", "1_0"), r"line 2: score: '1_0'"),
-    (GOOD.replace("0.75", ""), r"line 2: score with 0: ''; allowed: 1 number"),
-    (GOOD.replace(R, "1 0 0 0 1 0 0 0"), r"line 2: R with 8: .*; allowed: 9 numbers"),
-    (GOOD.replace(R, "[1 0 0 0 1 0 0 0 1]"), r"line 2: R: '\[1'"),
-    (GOOD.replace(R, "1 0 0 0 1 0 0 0 -1"), r"line 2: R .*; allowed: a rotation matrix"),
-    (GOOD.replace(R, "1.002 0 0 0 1 0 0 0 1"), r"line 2: R .*within 1e-3"),
-    (GOOD.replace(R, "1e200 0 0 0 1 0 0 0 1"), r"line 2: R .*a rotation matrix"),
-    (GOOD.replace("-10.5 20", "20"), r"line 2: t with 2: '20 812\.25'; allowed: 3 numbers"),
-    (GOOD.replace("-10.5", "NaN"), r"line 2: t: 'NaN'"),
-    (GOOD.replace("-10.5", "1e12"), r"line 2: t .*; allowed: millimetres"),
-    (GOOD.replace("812.25,0.5", "812.25,-2"), r"line 2: time '-2'; allowed: seconds, or -1"),
-    (GOOD.replace("812.25,0.5", "812.25,inf"), r"line 2: time: 'inf'"),
-    (GOOD.replace(T, "-0.01 0.02 0.81"), r"median length of 0\.8103, e\.g\. in line 2.*metres"),
-    (GOOD.replace(T, "0 0 812250"), r"median length of 8\.\d+e\+05, e\.g\. in line 2"),
-    (f"{GOOD}\n1,5,2,0.75,{R},0 0 700,1\n{GOOD}", r"line 4, which repeats line 2;.*once"),
-    (GOOD + "é", r"line 2, which is not ASCII text"),
-    (GOOD.replace("0.75", "0" * 5000), r"line 2 of more than 4096 bytes"),
-    (HEADER, r"line 2: scene_id 'scene_id'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1,4,2,0.75", r"line 2 with 4 fields; allowed: 7: scene_id,im_id"),
+        (GOOD + ",", r"line 2 with 8 fields"),
+        (GOOD.replace("1,4", "x,4", 1), r"line 2: scene_id 'x'; allowed: a whole number"),
+        (GOOD.replace("1,4", "-1,4", 1), r"line 2: scene_id '-1'"),
+        (GOOD.replace("1,4", "1,4.5", 1), r"line 2: im_id '4\.5'"),
+        (GOOD.replace("1,4", "1,99999999999", 1), r"line 2: im_id"),
+        (GOOD.replace(",2,", ",7,", 1), r"line 2: obj_id 7; allowed: the data set's objects: 2, 3"),
+        (GOOD.replace("0.75", "nan"), r"line 2: score: 'nan'; allowed: finite numbers"),
+        (GOOD.replace("0.75", "1e999"), r"line 2: score: '1e999'"),
+        (GOOD.replace("0.75", "1_0"), r"line 2: score: '1_0'"),
+        (GOOD.replace("0.75", ""), r"line 2: score with 0: ''; allowed: 1 number"),
+        (GOOD.replace(R, "1 0 0 0 1 0 0 0"), r"line 2: R with 8: .*; allowed: 9 numbers"),
+        (GOOD.replace(R, "[1 0 0 0 1 0 0 0 1]"), r"line 2: R: '\[1'"),
+        (GOOD.replace(R, "1 0 0 0 1 0 0 0 -1"), r"line 2: R .*; allowed: a rotation matrix"),
+        (GOOD.replace(R, "1.002 0 0 0 1 0 0 0 1"), r"line 2: R .*within 1e-3"),
+        (GOOD.replace(R, "1e200 0 0 0 1 0 0 0 1"), r"line 2: R .*a rotation matrix"),
+        (GOOD.replace("-10.5 20", "20"), r"line 2: t with 2: '20 812\.25'; allowed: 3 numbers"),
+        (GOOD.replace("-10.5", "NaN"), r"line 2: t: 'NaN'"),
+        (GOOD.replace("-10.5", "1e12"), r"line 2: t .*; allowed: millimetres"),
+        (GOOD.replace("812.25,0.5", "812.25,-2"), r"line 2: time '-2'; allowed: seconds, or -1"),
+        (GOOD.replace("812.25,0.5", "812.25,inf"), r"line 2: time: 'inf'"),
+        (GOOD.replace(T, "-0.01 0.02 0.81"), r"median length of 0\.8103, e\.g\. in line 2.*metres"),
+        (GOOD.replace(T, "0 0 812250"), r"median length of 8\.\d+e\+05, e\.g\. in line 2"),
+        (f"{GOOD}\n1,5,2,0.75,{R},0 0 700,1\n{GOOD}", r"line 4, which repeats line 2;.*once"),
+        (GOOD + "é", r"line 2, which is not ASCII text"),
+        (GOOD.replace("0.75", "0" * 5000), r"line 2 of more than 4096 bytes"),
+        (HEADER, r"line 2: scene_id 'scene_id'"),
+    ],
+)
 def test_a_wrong_line_is_rejected_with_its_number(line, message, tmp_path):
     path = write(tmp_path, f"{HEADER}\n{line}\n")
     with pytest.raises(UserError, match=message) as error:
@@ -123,12 +131,15 @@ def test_other_files_are_rejected(content, message, tmp_path, monkeypatch):
             read_results(path, {2})
 
 
-@pytest.mark.parametrize(("method", "dataset", "split", "name"), [
-    ("dopepp", "lmo", "test", "dopepp_lmo-test.csv"),
-    ("a (baseline)", "ycb_video", "train_pbr", "a-baseline_ycbvideo-train-pbr.csv"),
-    ("a/../b_c", "../..", "", "a-..-b-c_data-test.csv"),
-    ("_", "-", "/", "method_data-test.csv"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("method", "dataset", "split", "name"),
+    [
+        ("dopepp", "lmo", "test", "dopepp_lmo-test.csv"),
+        ("a (baseline)", "ycb_video", "train_pbr", "a-baseline_ycbvideo-train-pbr.csv"),
+        ("a/../b_c", "../..", "", "a-..-b-c_data-test.csv"),
+        ("_", "-", "/", "method_data-test.csv"),
+    ],
+)
 def test_file_names_have_bops_three_parts(method, dataset, split, name):
     assert results_name(method, dataset, split) == name
     assert name.count("_") == 1

@@ -83,16 +83,21 @@ def test_runs_go_down_the_columns_and_begin_with_zeros():
     assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), Node(STRICT, "x")).sum() == 0
 
 
-@pytest.mark.parametrize(("record", "message"), [
-    ({"counts": [6], "size": [3, 2]},
-     r"x: size \[3, 2\]; allowed: runs of the image's size \[2, 3\]"),
-    ({"counts": [5], "size": [2, 3]}, r"counts \[5\]"),
-    ({"counts": [-1, 7], "size": [2, 3]}, "counts"),
-    ({"counts": [1.0, 5.0], "size": [2, 3]}, "counts"),
-    ({"counts": "abc", "size": [2, 3]}, "counts 'abc'"),
-    ({"counts": [10**20], "size": [2, 3]}, "counts"),
-    (None, "missing"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        (
+            {"counts": [6], "size": [3, 2]},
+            r"x: size \[3, 2\]; allowed: runs of the image's size \[2, 3\]",
+        ),
+        ({"counts": [5], "size": [2, 3]}, r"counts \[5\]"),
+        ({"counts": [-1, 7], "size": [2, 3]}, "counts"),
+        ({"counts": [1.0, 5.0], "size": [2, 3]}, "counts"),
+        ({"counts": "abc", "size": [2, 3]}, "counts 'abc'"),
+        ({"counts": [10**20], "size": [2, 3]}, "counts"),
+        (None, "missing"),
+    ],
+)
 def test_damaged_runs(record, message):
     with pytest.raises(UserError, match=message):
         decode_runs(record, (2, 3), Node(STRICT, "x"))
@@ -149,15 +154,18 @@ OUTSIDE = ("../000000_000001.rgb.png", "/etc/x.rgb.png", "a/../../b.rgb.png", "a
 KINDS = (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE)
 
 
-@pytest.mark.parametrize(("files", "message"), [
-    *(([*COMPLETE, (name, b"x")], "leads out of the archive") for name in OUTSIDE),
-    *(([*COMPLETE, (link(kind), b"")], "a link, a device") for kind in KINDS),
-    ([*COMPLETE, COMPLETE[-1]], "'000000_000000.rgb.jpg' twice"),
-    ([*COMPLETE, ("000000_000000.rgb.png", b"x")], "two members for its image"),
-    (COMPLETE[:-1], "000000_000000 without rgb"),
-    (COMPLETE[1:], "000000_000000 without camera"),
-    ([*COMPLETE, ("README", b"x")], "which is not KEY.EXTENSION"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        *(([*COMPLETE, (name, b"x")], "leads out of the archive") for name in OUTSIDE),
+        *(([*COMPLETE, (link(kind), b"")], "a link, a device") for kind in KINDS),
+        ([*COMPLETE, COMPLETE[-1]], "'000000_000000.rgb.jpg' twice"),
+        ([*COMPLETE, ("000000_000000.rgb.png", b"x")], "two members for its image"),
+        (COMPLETE[:-1], "000000_000000 without rgb"),
+        (COMPLETE[1:], "000000_000000 without camera"),
+        ([*COMPLETE, ("README", b"x")], "which is not KEY.EXTENSION"),
+    ],
+)
 def test_hostile_members_are_rejected(files, message, tmp_path):
     with pytest.raises(UserError, match=message) as caught:
         index_shard(write_tar(tmp_path / "shard-000000.tar", files))

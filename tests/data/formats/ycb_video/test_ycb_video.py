@@ -152,12 +152,15 @@ def test_wrong_arguments_are_rejected(ycb_tree, box):
         YcbVideoReader(ycb_tree.root, [box], "train", "synthetic")
 
 
-@pytest.mark.parametrize(("frame", "name"), [
-    ("0000/000001", "009_gelatin_box"),
-    ("0050/000003", "003_cracker_box"),
-    ("0050/000003", "006_mustard_bottle"),
-    ("0051/000001", "005_tomato_soup_can"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("frame", "name"),
+    [
+        ("0000/000001", "009_gelatin_box"),
+        ("0050/000003", "003_cracker_box"),
+        ("0050/000003", "006_mustard_bottle"),
+        ("0051/000001", "005_tomato_soup_can"),
+    ],
+)
 def test_projected_cuboid_covers_the_real_label_at_its_depth(ycb_root, frame, name):
     part = ycb_part_of(ycb_root, name)
     sample = YcbVideoReader(ycb_root, [part], frames=[frame]).sample(0)
