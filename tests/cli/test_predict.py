@@ -1,7 +1,5 @@
 """``dopepp predict`` with a released network and several cameras."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -120,6 +118,13 @@ def test_the_distortion_of_the_lens_is_corrected(poses, folder, rendered, tmp_pa
         ("anim.gif", ["--camera", "K.txt"], "magick anim.gif image.png"),
         ("raw.png", ["--camera", "K.txt"], "magick raw.png -auto-level"),
         ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
+        pytest.param(
+            "whole.png",
+            ["--camera", "K.txt", "--device", "cuda"],
+            "device cuda (",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="it has CUDA"),
+        ),
+        ("97", ["--camera", "K.txt"], "got camera 97, which cannot be opened"),
     ],
 )
 def test_wrong_input_is_one_line(refused, folder, name, options, message, monkeypatch):
@@ -127,13 +132,6 @@ def test_wrong_input_is_one_line(refused, folder, name, options, message, monkey
     line = refused("predict", RELEASED, name, *options)
     assert line.startswith("got ")
     assert message in line
-
-
-def test_a_missing_device_is_one_line(refused, folder, intrinsics):
-    if torch.cuda.is_available():
-        pytest.skip("this machine has CUDA")
-    line = refused("predict", RELEASED, folder / "whole.png", *intrinsics, "--device", "cuda")
-    assert "device cuda (" in line
 
 
 @pytest.mark.parametrize(

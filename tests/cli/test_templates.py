@@ -62,10 +62,8 @@ def test_node_doctor_and_benchmark_take_a_mesh(run, truth, intrinsics):
     lines = run("doctor", *words).stdout.splitlines()
     assert all(line.startswith("ok ") for line in lines), lines
     assert "piv is detected, score" in lines[5]
-    table = run(
-        "benchmark", "piv.stl", "--unit", "mm", *RANGE, "--image", "part.png", *intrinsics, "-n", 1
-    )
-    assert "piv.stl" in table.stdout
+    words = ("piv.stl", "--unit", "mm", *RANGE, "--image", "part.png", *intrinsics, "-n", 1)
+    assert "piv.stl" in run("benchmark", *words).stdout
 
 
 def test_doctor_reports_that_no_pose_is_verified(run, near_truth, truth):
@@ -103,14 +101,15 @@ def test_wrong_options_are_one_line(refused, truth, intrinsics, command, words, 
 
 
 def test_wrong_options_of_single_commands_are_one_line(refused, truth):
-    line = refused("predict", *MESH, "--part", "piv.stl")
-    assert "got --part with the mesh piv.stl" in line
-    assert "piv.stl without --image" in refused("benchmark", "piv.stl", *RANGE)
-    K = ("--camera", "K.txt")
-    line = refused(
-        "predict", "piv.stl", "part.png", *K, *RANGE, "--depth", "d.png", "--refine", "depth"
-    )
-    assert "templates with refine=('depth',)" in line
+    for words, message in (
+        (("predict", *MESH, "--part", "piv.stl"), "got --part with the mesh piv.stl"),
+        (("benchmark", "piv.stl", *RANGE), "piv.stl without --image"),
+        (
+            ("predict", *MESH, "--depth", "d.png", "--refine", "depth"),
+            "templates with refine=('depth',)",
+        ),
+    ):
+        assert message in refused(*words)
 
 
 def test_the_page_shows_poses_without_maps(truth, folder, rendered):

@@ -1,7 +1,5 @@
 """Files that are complete or absent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -9,14 +7,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import (
-    IMAGES,
-    check_target,
-    read_limited,
-    write_file,
-    write_image,
-    write_png,
-)
+from dopepp.core.files import IMAGES, check_target, read_limited, write_file, write_image, write_png
 
 
 def test_a_png_keeps_its_pixels_in_rgb(tmp_path):

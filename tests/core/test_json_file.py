@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -9,12 +7,11 @@ from hypothesis import strategies as st
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_DEPTH, parse_json, read_json
 
+SCALARS = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.text()
+
+
 PLAIN = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**70), 2**70)
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(),
+    SCALARS | st.floats(allow_nan=False, allow_infinity=False),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     max_leaves=20,
 )
@@ -29,31 +26,27 @@ def test_parses_like_the_json_module(value, ascii_only, indent):
     assert parse_json(b"\xef\xbb\xbf" + text.encode(), "here") == json.loads(text)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"a":\n [1, NaN]}', "line 2, column 6: 'NaN', not a finite number"),
-        ('["NaN Infinity", -Infinity]', "line 1, column 18: '-Infinity'"),
-        ("[1.0, 1e308, 1e999]", "line 1, column 14: '1e999'"),
-        ("[" + "9" * 400 + ".5]", "line 1, column 2: '9"),
-        ("[-1E+400]", "line 1, column 2: '-1E"),
-        ('{"12": 1, "2": {"x": 1, "12": 2, "x": 3}}', "key 'x' twice"),
-        ('{"a": 1, "a": 1}', "key 'a' twice"),
-        ('{"a": 1', "line 1, column 8"),
-        ("", "line 1, column 1"),
-        ("[1] 2", "Extra data"),
-        (b'{"a": "\xff"}', "byte 7 is not UTF-8"),
-        ("{'a': 1}", "line 1, column 2"),
-        ("[" * 200_000, "more than 64 levels"),
-        ('{"a":' * 200_000, "more than 64 levels"),
-        ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "more than 64 levels"),
-        ('["]]]]", ' * 70 + "1" + "]" * 70, "more than 64 levels"),
-        ("9" * 5000, "digit"),
-        ('"' + '\\"' * 300_000, "line 1"),
-        ('"\\', "line 1"),
-    ],
-    ids=lambda value: repr(value)[:20],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ('{"a":\n [1, NaN]}', "line 2, column 6: 'NaN', not a finite number"),
+    ('["NaN Infinity", -Infinity]', "line 1, column 18: '-Infinity'"),
+    ("[1.0, 1e308, 1e999]", "line 1, column 14: '1e999'"),
+    ("[" + "9" * 400 + ".5]", "line 1, column 2: '9"),
+    ("[-1E+400]", "line 1, column 2: '-1E"),
+    ('{"12": 1, "2": {"x": 1, "12": 2, "x": 3}}', "key 'x' twice"),
+    ('{"a": 1, "a": 1}', "key 'a' twice"),
+    ('{"a": 1', "line 1, column 8"),
+    ("", "line 1, column 1"),
+    ("[1] 2", "Extra data"),
+    (b'{"a": "\xff"}', "byte 7 is not UTF-8"),
+    ("{'a': 1}", "line 1, column 2"),
+    ("[" * 200_000, "more than 64 levels"),
+    ('{"a":' * 200_000, "more than 64 levels"),
+    ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "more than 64 levels"),
+    ('["]]]]", ' * 70 + "1" + "]" * 70, "more than 64 levels"),
+    ("9" * 5000, "digit"),
+    ('"' + '\\"' * 300_000, "line 1"),
+    ('"\\', "line 1"),
+], ids=lambda value: repr(value)[:20])  # fmt: skip
 def test_invalid_json_is_refused_with_the_position(text, message):
     with pytest.raises(UserError) as caught:
         parse_json(text, "some/file.json")

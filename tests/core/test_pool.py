@@ -1,7 +1,5 @@
 """Pools: order, errors, lost processes, interruptions, and missing clusters."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal
@@ -16,6 +14,18 @@ import pytest
 from dopepp.core import pool as pool_module
 from dopepp.core.errors import UserError
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool
+
+
+def wait_for_group(process: int) -> None:
+    """Wait until all processes of a group have ended."""
+    for _ in range(600):
+        try:
+            os.killpg(process, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    pytest.fail("processes outlive their parent")
+
 
 EVALUATE = pickle.dumps(eval)
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
@@ -100,11 +110,11 @@ def test_a_function_that_cannot_be_unpickled_is_the_items_error():
 
 @posix
 def test_a_stopped_pool_completes_its_items(tmp_path):
-    item = f"__import__('time').sleep(0.5), open('{tmp_path}/done', 'x')"
     started = []
 
     def stop_in_the_middle() -> None:
         with ProcessPool(EVALUATE, 1) as pool:
+            item = f"__import__('time').sleep(0.5), open('{tmp_path}/done', 'x')"
             assert next(pool.run(["1", item]))[1].result() == 1
             started.extend(pool._processes)
             for number in (signal.SIGINT, signal.SIGTERM):  # the process continues
@@ -142,20 +152,13 @@ if __name__ == "__main__":
             print("done", flush=True)
 """
     (script := tmp_path / "script.py").write_text(code)
-    parent = subprocess.Popen(
-        [sys.executable, str(script)], stdout=subprocess.PIPE, start_new_session=True
-    )
+    command = [sys.executable, str(script)]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
     assert parent.stdout is not None
     assert parent.stdout.readline() == b"done\n"
     parent.kill()
     parent.wait()
-    for _ in range(200):
-        try:
-            os.killpg(parent.pid, 0)
-        except ProcessLookupError:  # no process of the group exists
-            return
-        time.sleep(0.05)
-    pytest.fail("processes outlive their parent")
+    wait_for_group(parent.pid)
 
 
 def test_without_ray_the_error_names_the_extra(monkeypatch):

@@ -1,7 +1,5 @@
 """Plain values are converted to typed objects; a mistake gives one line with its name."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

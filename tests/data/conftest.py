@@ -1,7 +1,5 @@
 """Fixtures: miniature data sets, samples, parts and render jobs."""
 
-import io
-import tarfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,18 +12,18 @@ import scipy.io
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dopepp.data.render_job import make_job
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import Part, make_part
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
 from dopepp.virtual.renderers.raster import silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import make_surface
+from tests.data.makers import mesh_of, pose_at
 
 HALF = np.array([0.04, 0.03, 0.02])
 
@@ -58,8 +56,7 @@ class FakeSource:
         width, height = self.size
         image = rng.integers(0, 256, (height, width, 3), np.uint8)
         K = camera_matrix(width, width, (width - 1) / 2, (height - 1) / 2)
-        T = np.eye(4)
-        T[:3, 3] = rng.uniform(-0.02, 0.02, 3) + np.array([0, 0, 0.25])
+        T = pose_at(*np.add(rng.uniform(-0.02, 0.02, 3), (0, 0, 0.25)))
         keypoints = project_keypoints(cuboid_keypoints(-HALF, HALF), T, K)
         mask = np.zeros((height, width), bool)
         low, high = np.nanmin(keypoints, axis=0), np.nanmax(keypoints, axis=0)
@@ -105,8 +102,7 @@ class YcbTree:
         label = np.zeros((72, 96), np.uint8)
         poses = np.zeros((3, 4, len(classes)))
         for i, class_index in enumerate(classes):
-            T = np.eye(4)
-            T[:3, 3] = (0.04 * i, 0.0, 0.3)
+            T = pose_at(0.04 * i, 0.0, 0.3)
             poses[..., i] = T[:3]
             corners = project_keypoints(cuboid_keypoints(-HALF, HALF), T, self.K)[:8]
             if labelled:
@@ -137,19 +133,6 @@ def ycb_tree(tmp_path):
     return YcbTree(tmp_path / "ycb")
 
 
-@pytest.fixture(scope="session")
-def contents():
-    """Read the files of a folder by relative path; subfolders have empty content."""
-
-    def read(root):
-        return {
-            str(path.relative_to(root)): path.read_bytes() if path.is_file() else b""
-            for path in root.rglob("*")
-        }
-
-    return read
-
-
 BOX = trimesh.creation.box((60.0, 40.0, 24.0))  # mm, with its centre beside the origin
 BOX.apply_translation((4.0, -6.0, 2.0))
 
@@ -167,26 +150,9 @@ def samples(parts):
 
 
 @pytest.fixture(scope="session")
-def write_set():
-    def write(writer_class, root, parts, samples, first=0):
-        """Write samples from an index on, finalize every chunk, and return the folder."""
-        writer = writer_class(root, parts)
-        writer.prepare()
-        indices = range(first, first + len(samples))
-        for index, sample in zip(indices, samples, strict=True):
-            writer.write(index, sample)
-        size = writer.chunk_size
-        for chunk in sorted({index // size for index in indices}):
-            writer.finalize(chunk, [index for index in indices if index // size == chunk])
-        return root
-
-    return write
-
-
-@pytest.fixture(scope="session")
 def boxes():
     """Two boxes of 60 × 40 × 24 mm, and three images of both, the second in front of the first."""
-    mesh = Mesh(np.asarray(BOX.vertices) / 1000, np.asarray(BOX.faces, np.int32))
+    mesh = mesh_of(BOX, 0.001)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])[None]
     axis = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     parts = [
@@ -212,38 +178,3 @@ def _boxes_at(parts, image):
     ]
     pixels = rng.integers(0, 256, (128, 128, 3), np.uint8)
     return Sample(pixels, K, instances, np.full((128, 128), 0.4, np.float32))
-
-
-@pytest.fixture(scope="session")
-def block():
-    """Make a block of 40 × 20 × 10 mm, named like BOP's files."""
-    half = np.array([0.02, 0.01, 0.005])
-    cuboid, diameter = cuboid_keypoints(-half, half), float(2 * np.linalg.norm(half))
-    return lambda number: Part(f"obj_{number:06d}", cuboid, diameter, cuboid[:8])
-
-
-@pytest.fixture(scope="session")
-def write_shard():
-    """Write a tar file of pairs (name or TarInfo, content); return its path."""
-
-    def write(path, files, **options):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tarfile.open(path, "w", **options) as archive:
-            for name, content in files:
-                info = name if isinstance(name, tarfile.TarInfo) else tarfile.TarInfo(name)
-                info.size = len(content) if info.isreg() else 0
-                archive.addfile(info, io.BytesIO(content))
-        return path
-
-    return write
-
-
-@pytest.fixture(scope="session")
-def small_job():
-    """Make a job of small images with other options."""
-
-    def make(layout="bop", **options):
-        defaults = {"preset": "quickstart", "size": "32x24", "layout": layout}
-        return make_job(["servoholder"], **defaults | options)
-
-    return make

@@ -20,16 +20,11 @@ from dopepp.virtual.backgrounds import ProceduralBackgrounds
 def build(fake_source):
     def build(**changes):
         options = {
-            "train": fake_source(12),
-            "val": fake_source(5),
-            "test": fake_source(3, size=(96, 72)),
-            "object_names": ["box"],
-            "input_size": (64, 64),
-            "batch_size": 4,
-            "masking": RandomMask(0.7),
-            "augment": Photometric(),
+            "train": fake_source(12), "val": fake_source(5), "test": fake_source(3, size=(96, 72)),
+            "object_names": ["box"], "input_size": (64, 64), "batch_size": 4,
+            "masking": RandomMask(0.7), "augment": Photometric(),
             "backgrounds": ProceduralBackgrounds(),
-        }
+        }  # fmt: skip
         return PoseDataModule(**(options | changes))
 
     return build
@@ -42,14 +37,11 @@ def batches(datamodule: PoseDataModule, epoch: int) -> list[Batch]:
 
 
 def assert_same(first: list[Batch], second: list[Batch]) -> None:
-    assert len(first) == len(second)
-    for left, other in zip(first, second, strict=True):
+    for left, right in zip(first, second, strict=True):
         for entry in fields(Batch):
-            a, b = getattr(left, entry.name), getattr(other, entry.name)
-            if isinstance(a, Tensor):
-                assert torch.equal(a.nan_to_num(), b.nan_to_num())
-            else:
-                assert a == b
+            a, b = getattr(left, entry.name), getattr(right, entry.name)
+            is_tensor = isinstance(a, Tensor)
+            assert torch.equal(a.nan_to_num(), b.nan_to_num()) if is_tensor else a == b
 
 
 @pytest.mark.parametrize("cached", [False, True])
@@ -66,17 +58,16 @@ def test_workers_do_not_change_the_batches(build, fake_source, cached):
 
 
 def test_epochs_differ_and_repeat(build):
+    def keys(epoch, **options):
+        return [key for batch in batches(build(**options), epoch) for key in batch.keys]
+
     datamodule = build()
-    first, second = batches(datamodule, 0), batches(datamodule, 1)
-    assert_same(first, batches(datamodule, 0))
-    assert sorted(key for batch in first for key in batch.keys) == sorted(
-        f"0/{i}" for i in range(12)
-    )
-    assert all(key.startswith("1/") for batch in second for key in batch.keys)
-    orders = [[key.split("/")[1] for batch in run for key in batch.keys] for run in (first, second)]
-    assert orders[0] != orders[1]
-    reseeded = batches(build(seed=1), 0)
-    assert [batch.keys for batch in reseeded] != [batch.keys for batch in first]
+    assert_same(batches(datamodule, 0), batches(datamodule, 0))
+    first, second = keys(0), keys(1)
+    assert sorted(first) == sorted(f"0/{i}" for i in range(12))
+    assert sorted(second) == sorted(f"1/{i}" for i in range(12))
+    assert [key[2:] for key in first] != [key[2:] for key in second]
+    assert keys(0, seed=1) != first
 
 
 def test_cached_images_keep_their_epoch_but_not_their_augmentation(build, fake_source):
@@ -145,19 +136,13 @@ def test_summary_and_fingerprint(build, fake_source):
 
 def test_size_ranges_are_measured_on_validation_images(build, fake_source):
     part = make_part("box", None, np.array([[0.0, 0, 0], [0.1, 0.1, 0.2]]))
-    can = replace(part, name="can")
-    source = fake_source(5)
-    depths = [
-        (detection.T_cam_obj @ [*part.cuboid[8], 1])[2]
-        for index in range(5)
-        for detection in source.sample(index).instances
-    ]
-    sample = source.sample(0)
-    focal = math.sqrt(sample.K[0, 0] * sample.K[1, 1]) * 64 / max(sample.size)
-    (name, seen), *rest = build().size_ranges([part, can]).items()
-    assert (name, rest) == ("box", [])
-    lengths = [focal * part.diameter / depth for depth in (max(depths), min(depths))]
-    assert seen == pytest.approx((*lengths, min(depths), max(depths)))
+    samples = [fake_source(5).sample(index) for index in range(5)]
+    depths = [(s.instances[0].T_cam_obj @ [*part.cuboid[8], 1])[2] for s in samples]
+    near, far, K = min(depths), max(depths), samples[0].K
+    focal = math.sqrt(K[0, 0] * K[1, 1]) * 64 / max(samples[0].size)
+    ranges = build().size_ranges([part, replace(part, name="can")])
+    expected = (focal * part.diameter / far, focal * part.diameter / near, near, far)
+    assert ranges == {"box": pytest.approx(expected)}
 
 
 def test_an_object_without_any_instance_fails_at_start(build):
@@ -175,8 +160,7 @@ def test_wrong_options(build):
 
 
 def test_collate_pads_instances(fake_source):
-    source = fake_source()
-    first, none, two = source.sample(0), source.sample(1), source.sample(2)
+    first, none, two = (fake_source().sample(index) for index in range(3))
     none.instances = []
     two.instances.append(replace(two.instances[0], label="can", masked_fraction=0.25))
     batch = collate([first, none, two], {"can": 0, "box": 1})
@@ -184,11 +168,12 @@ def test_collate_pads_instances(fake_source):
     assert (batch.images.dtype, batch.images.shape) == (torch.uint8, (3, 3, 48, 64))
     assert batch.images.is_contiguous(memory_format=torch.channels_last)
     np.testing.assert_array_equal(batch.images[2].permute(1, 2, 0).numpy(), two.image)
-    np.testing.assert_allclose(batch.K[0].numpy(), first.K)
-    np.testing.assert_allclose(batch.T_cam_obj[2, 1].numpy(), two.instances[1].T_cam_obj, rtol=1e-6)
-    np.testing.assert_allclose(
-        batch.keypoints[0, 0].numpy(), first.instances[0].keypoints, rtol=1e-6
-    )
+    for stored, given in (
+        (batch.K[0], first.K),
+        (batch.T_cam_obj[2, 1], two.instances[1].T_cam_obj),
+        (batch.keypoints[0, 0], first.instances[0].keypoints),
+    ):
+        np.testing.assert_allclose(stored.numpy(), given, rtol=1e-6)
     padding = batch.object_index == PADDING
     assert batch.keypoints[padding].isnan().all()
     assert not batch.keypoints[~padding].isnan().any()

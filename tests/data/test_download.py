@@ -2,7 +2,6 @@ import hashlib
 import io
 import logging
 import socket
-import tarfile
 import threading
 import urllib.request
 from http.client import HTTPMessage
@@ -15,19 +14,10 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.data import download as downloads
 from dopepp.data.download import DownloadSource, _Redirects, download, fetch
+from tests.data.makers import write_tar
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
-
-
-def make_tar() -> bytes:
-    pack = io.BytesIO()
-    with tarfile.open(fileobj=pack, mode="w") as tar:
-        for name in ("set/photos/a.jpg", "set/photos/b.jpg", "set/labels/a.xml"):
-            info = tarfile.TarInfo(name)
-            info.size = 100
-            tar.addfile(info, io.BytesIO(bytes(100)))
-    return pack.getvalue()
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -87,51 +77,56 @@ def url(server: Server, kind: str) -> str:
     return f"http://127.0.0.1:{server.server_port}/{kind}"
 
 
+@pytest.fixture
+def get(server, tmp_path):
+    """Download the file, which the server serves with a fault; return its path."""
+
+    def get(kind, path=tmp_path / "f", **options):
+        fetch(url(server, kind), path, len(CONTENT), SHA256, **options)
+        return path
+
+    return get
+
+
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_is_downloaded_completely(server, tmp_path):
-    seen = []
-    path = tmp_path / "new" / "file.bin"
-    fetch(url(server, "good"), path, len(CONTENT), SHA256, lambda *at: seen.append(at))
+def test_a_file_is_downloaded_completely(server, get, tmp_path):
+    seen, path = [], tmp_path / "new" / "file.bin"
+    get("good", path, progress=lambda *at: seen.append(at))
     assert path.read_bytes() == CONTENT
     assert names(path.parent) == ["file.bin"]
     assert seen[-1] == (len(CONTENT), len(CONTENT))
-    fetch(url(server, "good"), path, len(CONTENT), SHA256)
+    get("good", path)
     assert len(server.ranges) == 1  # a whole file is not fetched again
 
 
-def test_redirections_within_http_are_followed(server, tmp_path):
-    address = url(server, f"redirect:{url(server, 'good')}")
-    fetch(address, tmp_path / "f", len(CONTENT), SHA256)
-    assert (tmp_path / "f").read_bytes() == CONTENT
+def test_redirections_within_http_are_followed(server, get):
+    assert get(f"redirect:{url(server, 'good')}").read_bytes() == CONTENT
 
 
-def test_a_broken_connection_is_resumed(server, tmp_path):
-    path, half = tmp_path / "f", len(CONTENT) // 2
-    with pytest.raises(
-        UserError, match=rf"broke after {half} of 3000000 bytes; .*resumes the download"
-    ):
-        fetch(url(server, "cut"), path, len(CONTENT), SHA256)
+def test_a_broken_connection_is_resumed(server, get, tmp_path):
+    half = len(CONTENT) // 2
+    message = rf"broke after {half} of 3000000 bytes; .*resumes the download"
+    with pytest.raises(UserError, match=message):
+        get("cut")
     assert names(tmp_path) == ["f.partial"]
-    fetch(url(server, "good"), path, len(CONTENT), SHA256)
+    assert get("good").read_bytes() == CONTENT
     assert server.ranges == [None, f"bytes={half}-"]
-    assert path.read_bytes() == CONTENT
     assert names(tmp_path) == ["f"]
 
 
 @pytest.mark.parametrize("there", [1000, len(CONTENT), len(CONTENT) + 5])
-def test_any_partial_file_is_completed(server, tmp_path, there):
+def test_any_partial_file_is_completed(get, tmp_path, there):
     (tmp_path / "f.partial").write_bytes((CONTENT + bytes(5))[:there])
-    fetch(url(server, "no-range"), tmp_path / "f", len(CONTENT), SHA256)
-    assert (tmp_path / "f").read_bytes() == CONTENT
+    assert get("no-range").read_bytes() == CONTENT
 
 
-def test_a_server_that_resumes_at_another_byte_is_rejected(server, tmp_path):
+def test_a_server_that_resumes_at_another_byte_is_rejected(get, tmp_path):
     (tmp_path / "f.partial").write_bytes(CONTENT[:1000])
     with pytest.raises(UserError, match=r"continues at 'bytes 0-.* instead of byte 1000"):
-        fetch(url(server, "wrong-range"), tmp_path / "f", len(CONTENT), SHA256)
+        get("wrong-range")
 
 
 @pytest.mark.parametrize(
@@ -148,9 +143,9 @@ def test_a_server_that_resumes_at_another_byte_is_rejected(server, tmp_path):
         ("redirect:ftp://127.0.0.1/x", "unknown url type: ftp"),
     ],
 )
-def test_a_wrong_file_is_rejected_and_deleted(server, tmp_path, kind, message):
+def test_a_wrong_file_is_rejected_and_deleted(get, tmp_path, kind, message):
     with pytest.raises(UserError, match=message) as caught:
-        fetch(url(server, kind), tmp_path / "f", len(CONTENT), SHA256)
+        get(kind)
     assert "\n" not in str(caught.value)
     assert names(tmp_path) == []
 
@@ -176,29 +171,24 @@ def test_no_network_gives_one_line(tmp_path):
         fetch("file:///etc/passwd", tmp_path / "f", 1, SHA256)
 
 
-def test_a_folder_that_cannot_be_written_gives_one_line(server, tmp_path):
+def test_a_folder_that_cannot_be_written_gives_one_line(get, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError, match=r"file/f, which cannot be written"):
-        fetch(url(server, "good"), tmp_path / "file" / "f", len(CONTENT), SHA256)
+        get("good", tmp_path / "file" / "f")
 
 
 def test_a_data_set_is_unpacked_once(server, tmp_path, monkeypatch, caplog):
-    server.content = make_tar()
+    members = ("set/photos/a.jpg", "set/photos/b.jpg", "set/labels/a.xml")
+    archive = write_tar(tmp_path / "tiny.tar", [(name, bytes(100)) for name in members])
+    server.content, data = archive.read_bytes(), tmp_path / "data"
     digest = hashlib.sha256(server.content).hexdigest()
-    photos = PurePosixPath("set/photos")
-    source = DownloadSource(
-        url(server, "tiny.tar"), len(server.content), digest, photos, "free for tests"
-    )
+    facts = (len(server.content), digest, PurePosixPath("set/photos"), "free for tests")
+    source = DownloadSource(url(server, "tiny.tar"), *facts)
     monkeypatch.setitem(downloads.SOURCES, "tiny", source)
     with caplog.at_level(logging.INFO):
-        folder = download("tiny", tmp_path / "data")
+        folder = download("tiny", data)
     assert "free for tests" in caplog.text
-    assert folder == tmp_path / "data" / "tiny" / "set" / "photos"
-    assert (names(folder), names(tmp_path / "data")) == (["a.jpg", "b.jpg"], ["tiny"])
-    assert download("tiny", tmp_path / "data") == folder
+    assert folder == data / "tiny" / "set" / "photos"
+    assert (names(folder), names(data)) == (["a.jpg", "b.jpg"], ["tiny"])
+    assert download("tiny", data) == folder
     assert len(server.ranges) == 1
-
-
-def test_an_unknown_data_set_lists_the_known_ones():
-    with pytest.raises(UserError, match=r"unknown data set 'voc'; allowed: voc2007"):
-        download("voc", ".")

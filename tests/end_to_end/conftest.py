@@ -35,15 +35,3 @@ def run(trained, tmp_path):
     copy = tmp_path / "outputs" / folder.parent.name / folder.name
     shutil.copytree(folder, copy)
     return copy
-
-
-@pytest.fixture
-def frame_root(ycb_root, tmp_path):
-    """A YCB-Video folder with one real frame that can be damaged, and links to the rest."""
-    root = tmp_path / "ycb"
-    (root / "data" / "0050").mkdir(parents=True)
-    for name in ("models", "image_sets"):
-        (root / name).symlink_to(ycb_root / name)
-    for path in (ycb_root / "data" / "0050").glob("000003-*"):
-        (root / "data" / "0050" / path.name).write_bytes(path.read_bytes())
-    return root

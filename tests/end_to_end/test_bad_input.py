@@ -25,42 +25,37 @@ def train(call, tiny, tmp_path):
     return run
 
 
-@pytest.mark.parametrize(
-    ("overrides", "expected"),
-    [
-        (["data.bach_size=4"], "override 'data.bach_size', which names no option; allowed: the "
-                               "options of `--cfg job`, nearest data.batch_size"),
-        (["bop_csv=true"], "'bop_csv', which names no option; allowed: the options of `--cfg job`; "
-                           "bop_csv is an option of evaluate.py"),
-        (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),
-        (["trainer.max_epochs"], "trainer.max_epochs"),
-        (["trainer.max_epochs=1,2"], "Ambiguous value"),
-        (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),
-        (["trainer.precision=17"], "which Lightning rejects"),
-        (["trainer.accelerator=abacus"], "which Lightning rejects"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, list) else "",
-)  # fmt: skip
+@pytest.mark.parametrize(("overrides", "expected"), [
+    (["data.bach_size=4"], "override 'data.bach_size', which names no option; allowed: the "
+                           "options of `--cfg job`, nearest data.batch_size"),
+    (["bop_csv=true"], "'bop_csv', which names no option; allowed: the options of `--cfg job`; "
+                       "bop_csv is an option of evaluate.py"),
+    (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),
+    (["trainer.max_epochs"], "trainer.max_epochs"),
+    (["trainer.max_epochs=1,2"], "Ambiguous value"),
+    (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),
+    (["trainer.precision=17"], "which Lightning rejects"),
+    (["trainer.accelerator=abacus"], "which Lightning rejects"),
+], ids=lambda value: value[0] if isinstance(value, list) else "")  # fmt: skip
 def test_a_mistake_in_the_overrides(overrides, expected, train):
     assert expected in train(*overrides)
 
 
-def damage_image(root: Path) -> None:
-    """Cut the image in the middle, where OpenCV alone would return half of it."""
-    path = root / "data" / "0050" / "000003-color.png"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def test_a_frame_that_breaks_in_training_ends_it(frame_root, ycb_root, call, tmp_path):
+def test_a_frame_that_breaks_in_training_ends_it(ycb_root, call, tmp_path):
     """The training data are read by worker processes; their mistake reaches the user as it is."""
-    for name in ("color.png", "label.png", "meta.mat", "depth.png"):
-        folder = frame_root / "data" / "0000"
-        folder.mkdir(exist_ok=True)
-        source = ycb_root / "data" / "0000" / f"000001-{name}"
-        (folder / source.name).write_bytes(source.read_bytes())
-    damage_image(frame_root)
+    root = tmp_path / "ycb"
+    for frame in ("0000/000001", "0050/000003"):
+        for path in ycb_root.glob(f"data/{frame}-*"):
+            copy = root / path.relative_to(ycb_root)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    for name in ("models", "image_sets"):
+        (root / name).symlink_to(ycb_root / name)
+    # Cut in the middle, where OpenCV alone would return half of the image.
+    image = root / "data" / "0050" / "000003-color.png"
+    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
     done = call(
-        "train.py", "data=ycb_video", f"data.root={frame_root}", "model.width=0.0625",
+        "train.py", "data=ycb_video", f"data.root={root}", "model.width=0.0625",
         "data.objects=[003_cracker_box]", "data.input_size=[64,64]", "data.batch_size=1",
         "data.samples_per_epoch=2", "data.num_workers=1", "trainer=cpu", "trainer.max_epochs=1",
         "data.image_sets={train: train, val: train, test: train}", "data.masking._target_=null",
@@ -70,7 +65,7 @@ def test_a_frame_that_breaks_in_training_ends_it(frame_root, ycb_root, call, tmp
     assert not list(tmp_path.glob("outputs/**/metrics.json"))
 
 
-def hostile_pickle(path: Path, good: Path) -> None:
+def hostile_pickle(path: Path) -> None:
     class Command:
         def __reduce__(self) -> tuple[Any, tuple[str]]:
             return os.mkdir, (str(path.parent / "trace"),)
@@ -78,21 +73,17 @@ def hostile_pickle(path: Path, good: Path) -> None:
     torch.save({"state_dict": Command(), "dopepp": {}}, path)
 
 
-def absent(path: Path, good: Path) -> None:
-    pass
-
-
 @pytest.mark.parametrize(
     ("write", "place", "expected"),
     [
         (hostile_pickle, "ckpt_path", "which torch cannot load"),
         (hostile_pickle, "init_from", "which torch cannot load"),
-        (absent, "baseline", "which is not a file"),
+        (lambda path: None, "baseline", "which is not a file"),
     ],
 )
 def test_a_file_that_is_no_checkpoint(write, place, expected, trained, call, train, tmp_path):
     good, bad = trained[0] / "checkpoints" / "best.ckpt", tmp_path / "bad.ckpt"
-    write(bad, good)
+    write(bad)
     if place == "init_from":
         line = train(f"init_from={bad}")
     else:

@@ -30,13 +30,11 @@ def test_a_run_that_goes_on_tells_what_changed(run, call):
                 "data.batch_size=2", "resume_anyway=true", code=0)  # fmt: skip
     assert not trace.exists()
     said = [line for line in done.out.splitlines() if line.startswith("changed since")]
-    assert [line.partition(": ")[2] for line in said] == [
-        "data.batch_size: 4 → 2",
-        "optimizer.weight_decay: 0.01 → 0.5",
-        "trainer.max_epochs: 1 → 2",
-    ]
+    changes = ["data.batch_size: 4 → 2", "optimizer.weight_decay: 0.01 → 0.5",
+               "trainer.max_epochs: 1 → 2"]  # fmt: skip
+    assert [line.partition(": ")[2] for line in said] == changes
     versions = json.loads((run / "versions.json").read_text())
-    assert versions["changes"] == [line.partition(": ")[2] for line in said]
+    assert versions["changes"] == changes
     (earlier,) = versions["earlier"]
     assert earlier["changes"] == []
     content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)

@@ -120,10 +120,8 @@ def test_they_end_in_one_table_dope_first(sweep):
     assert "| [1](1/) | finished |" in readme
     assert (sweep / "1" / "README.md").read_text().startswith("# dope on virtual: finished")
     # Both saw the same data.
-    prints = [
-        json.loads((sweep / job / "versions.json").read_text())["data_fingerprint"] for job in "01"
-    ]
-    assert prints[0] == prints[1]
+    versions = [json.loads((sweep / job / "versions.json").read_text()) for job in "01"]
+    assert versions[0]["data_fingerprint"] == versions[1]["data_fingerprint"]
 
 
 def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
@@ -136,18 +134,14 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
         assert steps == sorted(steps)
         assert len(steps) == 2  # of this job's two steps, and no other's
         measured = json.loads((sweep / job / "metrics.json").read_text())
-        assert run.summary["test/pivconnector/auc_10cm"] == pytest.approx(
-            measured["objects"]["pivconnector"]["auc_10cm"]
-        )
-        assert run.summary["reference/best constant pose/pivconnector/add_01d"] == pytest.approx(
-            measured["references"]["best constant pose"]["pivconnector"]["add_01d"]
-        )
-        for kind, names in {
-            "test": {"overlay", "auc"},
-            "val": {"overlay", "auc", "belief"},
-        }.items():
-            folder = f"wandb/offline-run-*/files/media/images/{kind}"
-            assert {path.name.split("_")[0] for path in (sweep / job).glob(f"{folder}/*")} == names
+        auc = measured["objects"]["pivconnector"]["auc_10cm"]
+        constant = measured["references"]["best constant pose"]["pivconnector"]["add_01d"]
+        assert run.summary["test/pivconnector/auc_10cm"] == pytest.approx(auc)
+        reference = "reference/best constant pose/pivconnector/add_01d"
+        assert run.summary[reference] == pytest.approx(constant)
+        for kind, names in (("test", {"overlay", "auc"}), ("val", {"overlay", "auc", "belief"})):
+            images = (sweep / job).glob(f"wandb/offline-run-*/files/media/images/{kind}/*")
+            assert {path.name.split("_")[0] for path in images} == names
     comparison = only(sweep)
     assert (comparison.name, comparison.job_type) == ("comparison", "comparison")
     assert (comparison.group, comparison.exit_code) == (sweep.name, 0)
@@ -208,9 +202,8 @@ def test_tensorboard_holds_the_same(sweep):
     events = EventAccumulator(str(sweep / "0" / "tensorboard")).Reload()
     tags = events.Tags()
     assert {"train/loss", "test/pivconnector/add_01d"} <= set(tags["scalars"])
-    assert {"test/overlay", "test/auc", "val/overlay", "val/auc", "val/belief"} <= set(
-        tags["images"]
-    )
+    images = {"test/overlay", "test/auc", "val/overlay", "val/auc", "val/belief"}
+    assert images <= set(tags["images"])
     comparison = EventAccumulator(str(sweep / "tensorboard")).Reload()
     (text,) = comparison.Tensors("compare/text_summary")
     assert b"| dopepp" in text.tensor_proto.string_val[0]

@@ -132,14 +132,10 @@ def damage(path: Path, how: str) -> None:
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "byte",
-        pytest.param("cut", marks=pytest.mark.slow),
-        pytest.param("empty", marks=pytest.mark.slow),
-    ],
-)
+SLOW = [pytest.param(how, marks=pytest.mark.slow) for how in ("cut", "empty")]
+
+
+@pytest.mark.parametrize("how", ["byte", *SLOW])
 def test_resume_takes_the_newest_whole_checkpoint(how, run, call, caplog):
     whole = last(run)["state_dict"]
     folder = run / "checkpoints"

@@ -14,14 +14,7 @@ import torch
 
 from dopepp.core.files import read_csv
 from dopepp.training.system import PoseSystem
-
-
-def last_step(run: Path) -> int:
-    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["global_step"]
-
-
-def steps(run: Path) -> list[str]:
-    return [row["step"] for row in read_csv(run / "metrics.csv")]
+from tests.end_to_end.test_resume import last, steps
 
 
 @contextmanager
@@ -54,15 +47,13 @@ def test_a_signal_saves_the_step(call, find_run, tiny, tmp_path):
     assert "step 1" in done.last_line
     assert done.last_line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
-    assert last_step(run) == 1
+    assert last(run)["global_step"] == 1
     call("train.py", f"resume={run}", code=0)
-    assert steps(run) == ["0", "1"]
+    assert steps(run) == [0, 1]
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
-    call, find_run, tiny, tmp_path, monkeypatch
-):
+def test_a_second_ctrl_c_keeps_the_old_checkpoint(call, find_run, tiny, tmp_path, monkeypatch):
     save = torch.save
 
     def interrupted_save(content: dict[str, Any], stream: Any) -> None:
@@ -78,14 +69,12 @@ def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
         done = call("train.py", *tiny, *each, f"output_dir={tmp_path}", code=130)
     run = find_run(tmp_path)
     assert "saved up to step 1" in done.last_line
-    assert last_step(run) == 1
+    assert last(run)["global_step"] == 1
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.ckpt"]
 
 
 @pytest.mark.slow
-def test_a_job_that_slurm_requeues_goes_on_in_its_folder(
-    call, find_run, tiny, tmp_path, caplog, monkeypatch
-):
+def test_a_requeued_job_goes_on_in_its_folder(call, find_run, tiny, tmp_path, caplog, monkeypatch):
     caplog.set_level(logging.INFO)
     scontrol = tmp_path / "bin" / "scontrol"
     scontrol.parent.mkdir()
@@ -101,7 +90,7 @@ def test_a_job_that_slurm_requeues_goes_on_in_its_folder(
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     call(*command, code=0)
     assert "job 77 was requeued: continuing in" in caplog.text
-    assert steps(find_run(tmp_path / "outputs")) == ["0", "1"]
+    assert steps(find_run(tmp_path / "outputs")) == [0, 1]
 
 
 @pytest.mark.slow
@@ -155,11 +144,11 @@ def test_a_disk_that_stays_full_fails_the_run(small_disk, call, find_run, tiny):
     assert "No space left on device" in done.last_line
     assert done.last_line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
-    assert last_step(run) == 2
+    assert last(run)["global_step"] == 2
     (small_disk / "filler").unlink()
     call("train.py", f"resume={run}", code=0)
-    assert last_step(run) == 4
-    assert steps(run) == ["0", "1", "2", "3"]
+    assert last(run)["global_step"] == 4
+    assert steps(run) == [0, 1, 2, 3]
 
 
 def test_a_disk_that_is_too_small_is_refused_before_training(small_disk, call, tiny):

@@ -17,29 +17,36 @@ from omegaconf import OmegaConf
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, write_config, write_json
 from dopepp.experiment.results.report import Cost, Report
+from dopepp.experiment.run.evaluate import run_evaluation
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 
+
+@pytest.fixture
+def evaluate(composed, tmp_path):
+    """Run ``evaluate.py`` with overrides in a folder of the test; return its reports."""
+
+    def run(*overrides: str, folder: str = "run") -> list[Report]:
+        return run_evaluation(composed(*overrides, config="evaluate"), tmp_path / folder)
+
+    return run
+
+
 CONF = Path(__file__).parents[2] / "conf"
-
-
-@pytest.fixture(scope="session")
-def compositions():
-    """Cache of composed configs; composing takes a third of a second."""
-    return {}
+COMPOSED: dict[tuple[str, ...], Any] = {}
+"""Composed configs; composing takes a third of a second."""
 
 
 @pytest.fixture
-def composed(compositions):
+def composed():
     """Compose ``conf/train.yaml`` (or another config) with overrides, as a plain dict."""
 
     def make(*overrides: str, config: str = "train") -> dict[str, Any]:
         key = (config, *overrides)
-        if key not in compositions:
-            compositions[key] = OmegaConf.to_container(
-                compose(config, list(overrides)), resolve=True, throw_on_missing=True
-            )
-        return copy.deepcopy(compositions[key])
+        if key not in COMPOSED:
+            made = compose(config, list(overrides))
+            COMPOSED[key] = OmegaConf.to_container(made, resolve=True, throw_on_missing=True)
+        return copy.deepcopy(COMPOSED[key])
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield make
@@ -179,13 +186,3 @@ def write_run(
     elif result is not None:
         write_json(folder / FAILURE_FILE, {"reason": result})
     return folder
-
-
-@pytest.fixture(name="report_of")
-def make_report():
-    return report_of
-
-
-@pytest.fixture(name="write_run")
-def make_run():
-    return write_run

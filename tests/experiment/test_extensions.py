@@ -65,9 +65,7 @@ def mine(tmp_path, monkeypatch):
     return site
 
 
-def test_a_backbone_trains_and_its_checkpoint_loads(
-    mine, call, tiny_options, tmp_path, monkeypatch
-):
+def test_a_backbone_trains_and_a_checkpoint_loads(mine, call, tiny_options, tmp_path, monkeypatch):
     run = f"hydra.run.dir={tmp_path / 'run'}"
     call("train.py", *tiny_options, "trainer.max_steps=2", "experiment=mine", run, code=0)
     path = tmp_path / "run" / "checkpoints" / "last.ckpt"

@@ -42,7 +42,7 @@ def status_bytes(field: str) -> int:
 
 
 @contextlib.contextmanager
-def within(most_mb: int = MOST_MB) -> Iterator[None]:
+def bounded(most_mb: int = MOST_MB) -> Iterator[None]:
     """Fail if the block's peak of memory is above a limit, which also protects the machine."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (status_bytes("VmSize") + _SPARE_BYTES, hard))
@@ -57,9 +57,9 @@ def within(most_mb: int = MOST_MB) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def one_line(match: str) -> Iterator[None]:
+def refused(match: str) -> Iterator[None]:
     """Expect a UserError of one line within bounded memory."""
-    with within(), pytest.raises(UserError, match=match) as caught:
+    with bounded(), pytest.raises(UserError, match=match) as caught:
         yield
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 3000
@@ -68,21 +68,10 @@ def one_line(match: str) -> Iterator[None]:
     assert "allocat" not in caught.value.got.lower()
 
 
-@pytest.fixture(name="Call", scope="session")
-def call_class():
-    return Call
-
-
-@pytest.fixture(scope="session")
-def bounded():
-    """See :func:`within`."""
-    return within
-
-
-@pytest.fixture(scope="session")
-def refused():
-    """See :func:`one_line`."""
-    return one_line
+def rejected(path: Path, match: str) -> None:
+    """Expect that loading a checkpoint fails with one line for the user."""
+    with refused(match):
+        PoseEstimator.load(path)
 
 
 @pytest.fixture
@@ -102,9 +91,8 @@ def content(tiny_spec):
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
     part = make_part("bracket", Mesh(vertices, faces), vertices)
     weights = build_network(spec).state_dict()
-    return Checkpoint(
-        spec, weights, [part], (64, 64), 8, 1.0, {"centroid_threshold": 0.05}
-    ).to_file()
+    recovery = {"centroid_threshold": 0.05}
+    return Checkpoint(spec, weights, [part], (64, 64), 8, 1.0, recovery).to_file()
 
 
 @pytest.fixture
@@ -125,14 +113,3 @@ def saved(content, tmp_path):
         return tmp_path / "bad.ckpt"
 
     return save
-
-
-@pytest.fixture(scope="session")
-def rejected():
-    """Expect that loading a checkpoint fails with one line for the user."""
-
-    def load(path, match):
-        with one_line(match):
-            PoseEstimator.load(path)
-
-    return load

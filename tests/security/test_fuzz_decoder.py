@@ -99,22 +99,22 @@ def check(case: dict[str, Any]) -> None:
             raise
         return
     for detection in result:
-        assert np.isfinite(detection.T_cam_obj).all()
-        assert np.isfinite(detection.covariance).all()
-        assert np.isfinite(detection.reprojection_error_px)
+        for value in (detection.T_cam_obj, detection.covariance, detection.reprojection_error_px):
+            assert np.isfinite(value).all()
         assert 0 <= detection.score <= 1
         assert 0 <= detection.belief <= 1
-        np.testing.assert_allclose(
-            detection.T_cam_obj[:3, :3] @ detection.T_cam_obj[:3, :3].T, np.eye(3), atol=1e-6
-        )
+        R = detection.T_cam_obj[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
 
 
 def sound(case: dict[str, Any]) -> bool:
     """Return whether camera and cuboid are valid."""
-    fits = case["focal"] in (60.0, 1.0, 1e6) and case["principal"] in (50.0, 0.0)
-    return (
-        fits and all(length in (0.05, 1e-3, 1.0) for length in case["half"]) and case["centre"] <= 1
-    )
+    camera = case["focal"] in (60.0, 1.0, 1e6) and case["principal"] in (50.0, 0.0)
+    sides = all(length in (0.05, 1e-3, 1.0) for length in case["half"])
+    return camera and sides and case["centre"] <= 1
+
+
+BOX, K = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)[None], camera_matrix(60, 60, 50, 50)
 
 
 @settings(max_examples=QUICK, derandomize=True, database=None)
@@ -148,17 +148,13 @@ WRONG: Final = {
 @pytest.mark.parametrize("name", WRONG)
 def test_maps_of_other_shapes(name):
     belief, field, objects, message = WRONG[name]
-    box = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)
-    K = camera_matrix(60, 60, 50, 50)
-    cuboids = np.stack([box] * objects) if objects else np.zeros((0, 9, 3))
     with pytest.raises(ValueError, match=message):
-        recover(torch.zeros(belief), torch.zeros(field), cuboids, K)
+        recover(torch.zeros(belief), torch.zeros(field), np.repeat(BOX, objects, axis=0), K)
 
 
 def test_names_and_cameras_must_be_as_many_as_objects_and_images():
-    box = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)[None]
-    K, maps = camera_matrix(60, 60, 50, 50), (torch.zeros(2, 9, 8, 8), torch.zeros(2, 16, 8, 8))
+    belief, field = torch.zeros(2, 9, 8, 8), torch.zeros(2, 16, 8, 8)
     with pytest.raises(ValueError, match="1 objects need as many names"):
-        recover(maps[0][0], maps[1][0], box, K, names=["a", "b"])
+        recover(belief[0], field[0], BOX, K, names=["a", "b"])
     with pytest.raises(ValueError, match="2 images need as many camera matrices"):
-        recover_batch(*maps, box, K)
+        recover_batch(belief, field, BOX, K)

@@ -31,14 +31,8 @@ from dopepp.core.yaml import read_yaml
 from dopepp.data.archive import safe_extract
 from dopepp.data.check import check_dataset
 from dopepp.data.formats.bop.bop_models import bop_parts
-from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.bop.bop_results import read_results
-from dopepp.data.formats.bop.bop_writer import BopWriter
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
-from dopepp.data.formats.ndds.ndds_reader import NddsReader
-from dopepp.data.formats.ndds.ndds_writer import NddsWriter
-from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
-from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 from dopepp.data.formats.ycb_video import read_meta
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
@@ -46,7 +40,8 @@ from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.models.checkpoint import load_network
 from dopepp.models.storage import read_safetensors, write_safetensors
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import Mesh, make_part
+from dopepp.parts.part import make_part
+from tests.data.makers import LAYOUTS, mesh_of, pose_at, write_set
 
 QUICK: Final = 6
 THOROUGH: Final = 300
@@ -182,10 +177,8 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
                                (5, 5), 2)  # fmt: skip
     tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.zeros(0, dtype=torch.int8)}
     rows = "scene_id,im_id,obj_id,score,R,t,time\n" + "1,4,2,0.75,1 0 0 0 0 -1 0 1 0,-10 20 812,1\n"
-    T = np.eye(4)
-    T[2, 3] = 0.4
     meta = {
-        "cls_indexes": np.array([[2.0]]), "poses": T[:3, :, None],
+        "cls_indexes": np.array([[2.0]]), "poses": pose_at(0, 0, 0.4)[:3, :, None],
         "intrinsic_matrix": np.eye(3), "factor_depth": 10000,
     }  # fmt: skip
     text = {
@@ -253,34 +246,25 @@ def _extract(path: Path) -> None:
 
 def _datasets(root: Path) -> dict[str, Target]:
     """Write two images in each layout with a writer."""
-    box = trimesh.creation.box((40.0, 30.0, 20.0))
-    part = make_part("obj_000001", Mesh(box.vertices / 1000, box.faces.astype(np.int32)))
-    T = np.eye(4)
-    T[2, 3] = 0.3
-    K = camera_matrix(40.0, 40.0, 15.5, 11.5)
+    part = make_part("obj_000001", mesh_of(trimesh.creation.box((0.04, 0.03, 0.02))))
+    T, K = pose_at(0, 0, 0.3), camera_matrix(40.0, 40.0, 15.5, 11.5)
     mask = np.zeros((24, 32), bool)
     mask[10:14, 13:19] = True
     instance = Instance(part.name, T, project_keypoints(part.cuboid, T, K), 0.9, mask)
     depth = np.full((24, 32), 0.3, np.float32)
     sample = Sample(np.full((24, 32, 3), 90, np.uint8), K, [instance], depth)
-    writers = {"bop": BopWriter, "shards": WebdatasetWriter, "ndds": NddsWriter}
-    for name, writer_class in writers.items():
-        writer = writer_class(root / name, [part])
-        writer.prepare()
-        for index in range(2):
-            writer.write(index, sample)
-        writer.finalize(0, range(2))
-    readers: dict[str, Callable[[Path], object]] = {
-        "bop": lambda folder: read_all(BopReader(folder, bop_parts(folder), "train_pbr")),
-        "ndds": lambda folder: read_all(NddsReader(folder, [part])),
-        "shards": lambda folder: read_all(WebdatasetReader(folder, bop_parts(folder), "train_pbr")),
-    }
     made = {}
-    for name, read in readers.items():
-        for file in sorted((root / name).rglob("*")):
+    for name, layout in (("bop", "BOP"), ("shards", "BOP-WebDataset"), ("ndds", "NDDS")):
+        writer, reader = LAYOUTS[layout]
+        folder = write_set(writer, root / name, [part], [sample] * 2)
+
+        def read(folder: Path, name: str = name, reader: Any = reader) -> None:
+            read_all(reader(folder, [part] if name == "ndds" else bop_parts(folder)))
+
+        for file in sorted(folder.rglob("*")):
             if file.suffix in (".json", ".tar") and "000001.json" not in file.name:
-                relative = str(file.relative_to(root / name))
-                made[f"{name}/{relative}"] = Target(root / name, relative, (read, check_dataset))
+                relative = str(file.relative_to(folder))
+                made[f"{name}/{relative}"] = Target(folder, relative, (read, check_dataset))
     return made
 
 
@@ -303,15 +287,15 @@ def examine(target: Target, content: bytes, place: Path) -> int:
     return num_taken
 
 
-def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
-    """Damage a good file in many ways."""
+def fuzz(target: Target, folder: Path, num_files: int) -> None:
+    """Damage a good file in many ways; few damages are the same in every run."""
     good = (target.folder / target.file).read_bytes()
     num_taken = examine(target, good, folder)
     # Not every reader of images accepts every format.
     assert num_taken == len(target.reads) or (num_taken and len(target.reads) > 2)
 
     @settings(
-        max_examples=num_files, derandomize=repeat, database=None,
+        max_examples=num_files, derandomize=num_files == QUICK, database=None,
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(damage())
@@ -321,16 +305,13 @@ def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
     check()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_damaged_files(name, targets, tmp_path):
-    fuzz(targets[name], tmp_path, QUICK, repeat=True)
+MANY = pytest.param(THOROUGH, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("num_files", [QUICK, MANY])
 @pytest.mark.parametrize("name", NAMES)
-def test_many_damaged_files(name, targets, tmp_path):
-    fuzz(targets[name], tmp_path, THOROUGH, repeat=False)
+def test_damaged_files(name, num_files, targets, tmp_path):
+    fuzz(targets[name], tmp_path, num_files)
 
 
 def test_every_undamaged_file_is_read(targets):

@@ -12,6 +12,7 @@ import torch
 
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
+from tests.security.conftest import bounded, rejected
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -30,7 +31,7 @@ def pack(path: Path, content: list[tuple[str, bytes]], method: int = zipfile.ZIP
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize("again", ["good/data.pkl", "GOOD/DATA.PKL", "good/data/0"])
-def test_two_members_of_one_name(again, good, tmp_path, rejected):
+def test_two_members_of_one_name(again, good, tmp_path):
     """Readers differ in which member of two equal names they read."""
     folder = next(iter(members(good))).split("/")[0]
     content = [(name.replace(folder, "good"), data) for name, data in members(good).items()]
@@ -38,13 +39,13 @@ def test_two_members_of_one_name(again, good, tmp_path, rejected):
     rejected(path, "two members with equal names")
 
 
-def test_two_pickles_in_two_folders(good, tmp_path, rejected):
+def test_two_pickles_in_two_folders(good, tmp_path):
     content = list(members(good).items())
     path = pack(tmp_path / "bad.ckpt", [("other/data.pkl", b"\x80\x02N."), *content])
     rejected(path, "2 members FOLDER/data.pkl")
 
 
-def test_an_archive_after_other_bytes(good, tmp_path, rejected):
+def test_an_archive_after_other_bytes(good, tmp_path):
     """torch would read the first pickle, which was not checked."""
     path = tmp_path / "bad.ckpt"
     for first in (b"\x80\x02}.", b"#!/bin/sh\n", bytes(512)):
@@ -53,7 +54,7 @@ def test_an_archive_after_other_bytes(good, tmp_path, rejected):
 
 
 @pytest.mark.parametrize("name", ["../data.pkl", "/etc/data.pkl", "a/../../data.pkl"])
-def test_members_that_lead_out_of_the_archive(name, good, tmp_path, rejected):
+def test_members_that_lead_out_of_the_archive(name, good, tmp_path):
     content = [*members(good).items(), (name, b"\x80\x02N.")]
     path = pack(tmp_path / "bad.ckpt", content)
     rejected(path, "bad.ckpt, which torch cannot load")
@@ -61,13 +62,13 @@ def test_members_that_lead_out_of_the_archive(name, good, tmp_path, rejected):
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_zip_bomb(method, tmp_path, rejected):
+def test_a_zip_bomb(method, tmp_path):
     path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(50_000_000))], method)
     assert path.stat().st_size < 100_000
     rejected(path, "which unpacks to 50000000 bytes")
 
 
-def test_a_wrong_declared_size(tmp_path, rejected):
+def test_a_wrong_declared_size(tmp_path):
     """The directory states 10 bytes or 10 terabytes for a member of 1,000 bytes."""
     path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(1000))])
     content = bytearray(path.read_bytes())
@@ -78,7 +79,7 @@ def test_a_wrong_declared_size(tmp_path, rejected):
         rejected(path, r"bad\.ckpt, which")
 
 
-def test_overlapping_members(tmp_path, rejected):
+def test_overlapping_members(tmp_path):
     """A thousand entries of the directory share the bytes of one member."""
     path = pack(tmp_path / "one.ckpt", [("a/data/0", bytes(100_000))])
     content = path.read_bytes()
@@ -136,12 +137,12 @@ FIELDS = {
     ("field", "value"),
     [(field, "a billion laughs") for field in FIELDS] + [("data", value) for value in VALUES],
 )
-def test_values_of_huge_size(field, value, saved, rejected):
+def test_values_of_huge_size(field, value, saved):
     bad = VALUES[value]()
     rejected(saved(lambda c: FIELDS[field](c, bad)), r"bad\.ckpt")
 
 
-def test_a_payload_nested_very_deep(tmp_path, rejected):
+def test_a_payload_nested_very_deep(tmp_path):
     deep = b"]" * 100_000 + b"a" * 99_999
     pickled = b"\x80\x02}X\x06\x00\x00\x00dopepp}X\x04\x00\x00\x00data" + deep
     pickled += b"ssX\x0a\x00\x00\x00state_dict}s."
@@ -168,7 +169,7 @@ TARGETS = (
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: repr(target)[:60])
-def test_a_target_outside_of_the_list(target, saved, canary, rejected):
+def test_a_target_outside_of_the_list(target, saved, canary):
     node = {"_target_": target, "command": canary, "_args_": [canary], "width": 0.125}
     path = saved(lambda c: c["dopepp"]["spec"].update(backbone=node))
     rejected(path, r"backbone _target_ .*bad\.ckpt")
@@ -203,13 +204,11 @@ TOO_MUCH = {
     "inputs of terapixels": (payload(input_size=[10**7, 10**7]), r"input_size=\[10000000"),
     "inputs of one pixel too many": (payload(input_size=[8193, 64]), r"input_size=\[8193"),
     "a billion peaks": (payload(recovery={"max_peaks": 10**9}), "max_peaks=1000000000"),
-    "a threshold of nothing": (
-        payload(recovery={"peak_threshold": float("nan")}), "peak_threshold=nan",
-    ),
+    "a threshold of nothing": (payload(recovery={"peak_threshold": float("nan")}),
+                               "peak_threshold=nan"),
     "peaks as wide as the sky": (payload(sigma=1e300), "sigma"),
-    "a million symmetries": (
-        part(symmetries_discrete=[np.eye(4).tolist()] * 2000), "symmetries_discrete",
-    ),
+    "a million symmetries": (part(symmetries_discrete=[np.eye(4).tolist()] * 2000),
+                             "symmetries_discrete"),
     "a million points": (part(points=[[0.0, 0.0, 0.0]] * 100_001), "points"),
     "points beyond the moon": (part(points=[[1e300, 0.0, 0.0]]), "points"),
     "a cuboid inside out": (part(cuboid=[[0.0, 0.0, 0.0]] * 8 + [[1.0, 1, 1]]), "axis-aligned"),
@@ -241,7 +240,7 @@ TOO_MUCH |= {name: (weight(make), "weights that do not fit") for name, make in W
 
 
 @pytest.mark.parametrize("name", TOO_MUCH)
-def test_a_spec_a_table_or_weights_of_huge_size(name, saved, canary, rejected):
+def test_a_spec_a_table_or_weights_of_huge_size(name, saved, canary):
     edit, message = TOO_MUCH[name]
     rejected(saved(edit), message)
 
@@ -250,7 +249,7 @@ def test_a_spec_a_table_or_weights_of_huge_size(name, saved, canary, rejected):
     "value",
     [float("nan"), *(pytest.param(v, marks=pytest.mark.slow) for v in (-float("inf"), 3e38))],
 )
-def test_weights_of_nan_give_no_detection(value, saved, bounded):
+def test_weights_of_nan_give_no_detection(value, saved):
     def spoil(content):
         for tensor in content["state_dict"].values():
             if tensor.is_floating_point():

@@ -13,6 +13,7 @@ from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import parse_description
 from dopepp.models.storage import MAX_HEADER_BYTES
+from tests.security.conftest import refused, rejected
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -166,19 +167,18 @@ GRAPHS = {
             helper.make_tensor_value_info("more", FLOAT, [1]))), "inputs .*more",
     ),
     "a missing output": (graph_edit(lambda graph: graph.output.pop()), "outputs .'belief'."),
-    "an edge to nowhere": (
-        graph_edit(lambda graph: graph.node[1].input.__setitem__(0, "nowhere")), r"a\.onnx: ",
-    ),
+    "an edge to nowhere": (graph_edit(lambda graph: graph.node[1].input.__setitem__(0, "nowhere")),
+                           r"a\.onnx: "),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_a_graph_with_other_operations_than_an_export(name, spoilt, rejected):
+def test_a_graph_with_other_operations_than_an_export(name, spoilt):
     edit, message = GRAPHS[name]
     rejected(spoilt(edit), message)
 
 
-def test_the_unchanged_file_loads_with_its_own_shape_only(spoilt, refused):
+def test_the_unchanged_file_loads_with_its_own_shape_only(spoilt):
     estimator = PoseEstimator.load(spoilt())
     belief, field = estimator.network.maps(torch.zeros(2, 3, 64, 40, dtype=torch.uint8))
     assert (belief.shape, field.shape) == ((2, 9, 8, 5), (2, 16, 8, 5))
@@ -193,61 +193,57 @@ def test_the_unchanged_file_loads_with_its_own_shape_only(spoilt, refused):
         other.predict(np.zeros((64, 64, 3), np.uint8), camera_matrix(64, 64, 31.5, 31.5))
 
 
-def edited(payload, **changes):
-    return json.dumps(payload | changes)
-
-
-def section(payload, **changes):
-    return edited(payload, export=SECTION | changes)
-
-
 ATTACK = {"_target_": "os.system", "command": "touch canary"}
 DESCRIPTIONS = {
-    "none": (lambda payload: None, "no description"),
-    "cut": (lambda payload: json.dumps(payload)[:500], "line 1, column"),
+    "none": (None, "no description"),
+    "cut": ('{"spec": {"backbone": {"_target_"', "line 1, column"),
+    "a list": ("[1]", "a description of type list"),
+    "too long": (" " * (MAX_HEADER_BYTES + 1), "a description of 16000001"),
+    "a call": ({"spec": {"backbone": ATTACK}}, "backbone _target_ 'os.system'"),
+    "a call by its name": ({"spec": {"head": "os.system"}}, "head _target_ 'os.system'"),
+    "a spec of another kind": ({"spec": {}}, "a model spec with"),
+    "no parts": ({"parts": []}, "0 parts"),
+    "a newer version": ({"format_version": 99}, "format_version 99"),
+    "a stride of none": ({"stride": 0}, "stride=0"),
+    "an input of gigapixels": ({"input_size": [2**20, 2**20]}, "input_size"),
+    "a multiple of gigapixels": ({"export": {"size_multiple": 2**30}}, "1073741824"),
+    "a multiple of nothing": ({"export": {"size_multiple": 7}}, "size_multiple 7"),
+    "a rate of text": ({"export": {"add_01d": {"int8": "1"}}}, "int8='1'"),
+    "another field": ({"export": {"code": "import os"}}, r"export\.code"),
+    "no section": ({"export": None}, "export=None"),
+}
 
-    "a list": (lambda payload: "[1]", "a description of type list"),
 
-    "too long": (lambda payload: " " * (MAX_HEADER_BYTES + 1), "a description of 16000001"),
-    "a call": (
-        lambda payload: edited(payload, spec=payload["spec"] | {"backbone": ATTACK}),
-        "backbone _target_ 'os.system'",
-    ),
-    "a call by its name": (
-        lambda payload: edited(payload, spec=payload["spec"] | {"head": "os.system"}),
-        "head _target_ 'os.system'",
-    ),
-    "a spec of another kind": (lambda payload: edited(payload, spec={}), "a model spec with"),
-    "no parts": (lambda payload: edited(payload, parts=[]), "0 parts"),
-    "a newer version": (lambda payload: edited(payload, format_version=99), "format_version 99"),
-    "a stride of none": (lambda payload: edited(payload, stride=0), "stride=0"),
-    "an input of gigapixels": (
-        lambda payload: edited(payload, input_size=[2**20, 2**20]), "input_size",
-    ),
-    "a multiple of gigapixels": (
-        lambda payload: section(payload, size_multiple=2**30), "1073741824",
-    ),
-    "a multiple of nothing": (lambda payload: section(payload, size_multiple=7), "size_multiple 7"),
-    "a rate of text": (lambda payload: section(payload, add_01d={"int8": "1"}), "int8='1'"),
-    "another field": (lambda payload: section(payload, code="import os"), r"export\.code"),
-    "no section": (lambda payload: edited(payload, export=None), "export=None"),
-}  # fmt: skip
+"""Texts, or changes of the payload; a mapping that is not empty is merged into the old one."""
 
 
 @pytest.mark.parametrize("name", DESCRIPTIONS)
-def test_a_wrong_description(name, payload, spoilt, rejected):
+def test_a_wrong_description(name, payload, spoilt):
     text, message = DESCRIPTIONS[name]
-    changed = text(payload)
+    if isinstance(text, dict):
+        is_merged = {key: isinstance(new, dict) and new != {} for key, new in text.items()}
+        merged = {key: payload[key] | new if is_merged[key] else new for key, new in text.items()}
+        text = json.dumps(payload | merged)
 
     def edit(made):
         del made.metadata_props[:]
-        if changed is not None:
-            made.metadata_props.add(key="dopepp", value=changed)
+        if text is not None:
+            made.metadata_props.add(key="dopepp", value=text)
 
     rejected(spoilt(edit), message)
 
 
-def test_other_files_than_onnx(spoilt, good, tmp_path, rejected):
+def replaced(pattern: str, by: str):
+    return lambda xml: re.sub(pattern, by, xml)
+
+
+ENTITIES = '<!DOCTYPE net [<!ENTITY a "aaaaaaaaaa">]>'
+
+
+STRIDE = "&quot;stride&quot;: "
+
+
+def test_other_files_than_onnx(spoilt, good, tmp_path):
     whole = spoilt().read_bytes()
     path = tmp_path / "b.onnx"
     for content in (b"", whole[:-700], whole[:40], good.read_bytes(), b"\xff" * 1000, b"[]"):
@@ -287,35 +283,25 @@ def folder(translated, tmp_path):
 XMLS = {
     "cut": (lambda xml: xml[:3000], "not an XML file, or truncated"),
     "nothing": (lambda xml: "", "not an XML file, or truncated"),
-    "entities": (
-        lambda xml: '<!DOCTYPE net [<!ENTITY a "aaaaaaaaaa">]>' + xml, "declarations or comments",
-    ),
+    "entities": (lambda xml: ENTITIES + xml, "declarations or comments"),
     "an operator of a library": (
         lambda xml: xml.replace('version="opset1"', 'version="extension"', 1),
         r"operator extension\.",
     ),
     "a graph inside": (lambda xml: xml.replace("<output>", "<body/><output>", 1), "nested graph"),
-    "a constant beyond the file": (
-        lambda xml: re.sub(r'offset="\d+"', 'offset="99999999"', xml), "of 9999|offset 9999",
-    ),
-    "a negative constant": (lambda xml: re.sub(r'offset="\d+"', 'offset="-8"', xml), "offset -8"),
-    "a constant of terabytes": (
-        lambda xml: re.sub('shape="9, ?3,', 'shape="1099511627776, 3,', xml), r"a: ",
-    ),
-    "an unknown operator": (lambda xml: xml.replace('"Convolution"', '"Launch"'), "Launch"),
-    "no description": (lambda xml: re.sub(r"<dopepp [^>]*>", "", xml), "no description"),
-    "a cut description": (
-        lambda xml: re.sub(r'(<dopepp value=".{200})[^>]*>', r'\1"/>', xml), "line 1, column",
-    ),
-    "a call": (lambda xml: xml.replace("dopepp.models.backbones.DSC", "os.system"), "os.system"),
-    "a longer stride": (
-        lambda xml: xml.replace("&quot;stride&quot;: 8", "&quot;stride&quot;: 0"), "stride=0",
-    ),
-}  # fmt: skip
+    "a constant beyond": (replaced(r'offset="\d+"', 'offset="99999999"'), "of 9999|offset 9999"),
+    "a negative constant": (replaced(r'offset="\d+"', 'offset="-8"'), "offset -8"),
+    "a constant of terabytes": (replaced('shape="9, ?3,', 'shape="1099511627776, 3,'), "a: "),
+    "an unknown operator": (replaced('"Convolution"', '"Launch"'), "Launch"),
+    "no description": (replaced(r"<dopepp [^>]*>", ""), "no description"),
+    "a cut text": (replaced(r'(<dopepp value=".{200})[^>]*>', r'\1"/>'), "line 1, column"),
+    "a call": (replaced(r"dopepp\.models\.backbones\.DSC", "os.system"), "os.system"),
+    "a longer stride": (replaced(f"{STRIDE}8", f"{STRIDE}0"), "stride=0"),
+}
 
 
 @pytest.mark.parametrize("name", XMLS)
-def test_an_openvino_file_with_other_operations_than_an_export(name, folder, rejected):
+def test_an_openvino_file_with_other_operations_than_an_export(name, folder):
     edit, message = XMLS[name]
     path = folder / "model.xml"
     xml = path.read_text()
@@ -324,7 +310,7 @@ def test_an_openvino_file_with_other_operations_than_an_export(name, folder, rej
     rejected(folder, message)
 
 
-def test_an_incomplete_openvino_folder(folder, tmp_path, rejected):
+def test_an_incomplete_openvino_folder(folder, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(folder, moved)
     assert PoseEstimator.load(moved).parts[0].name == "bracket"

@@ -28,6 +28,7 @@ from dopepp.data.formats.ycb_video import read_meta
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
 from dopepp.parts import read_mesh
 from dopepp.parts.mesh.read import ycb_part
+from tests.security.conftest import bounded, refused
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -114,7 +115,7 @@ def made(content: Any) -> bytes:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("name", IMAGES)
-def test_hostile_images(name, suffix, tmp_path, refused, bounded):
+def test_hostile_images(name, suffix, tmp_path):
     path = tmp_path / f"image{suffix}"
     content = made(IMAGES[name])
     path.write_bytes(content)
@@ -143,7 +144,7 @@ def test_the_first_image_of_an_animation_is_read(kind, tmp_path):
     assert read_picture(path).shape == (12, 16, 3)
 
 
-def test_image_paths_without_a_file(tmp_path, refused):
+def test_image_paths_without_a_file(tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
     for name in ("folder.png", "loop.png", "x" * 300 + ".png", "none.png"):
@@ -200,7 +201,7 @@ MESHES = {
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_hostile_meshes(name, tmp_path, refused):
+def test_hostile_meshes(name, tmp_path):
     path = tmp_path / "deep" / name.split("|")[0]
     path.parent.mkdir()
     path.write_bytes(MESHES[name])
@@ -208,21 +209,20 @@ def test_hostile_meshes(name, tmp_path, refused):
         read_mesh(path, "mm")
 
 
-def test_a_material_with_a_texture_outside_its_folder(tmp_path, refused):
+def test_a_material_with_a_texture_outside_its_folder(tmp_path):
     Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")
     folder = tmp_path / "part"
     folder.mkdir()
     (folder / "link.png").symlink_to(tmp_path / "secret.png")
-    (folder / "a.obj").write_text(
-        "mtllib a.mtl\nv 0 0 0\nv 9 0 0\nv 0 9 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
-    )
+    textured = "mtllib a.mtl\nv 0 0 0\nv 9 0 0\nv 0 9 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+    (folder / "a.obj").write_text(textured)
     for name in (str(tmp_path / "secret.png"), "../secret.png", "link.png", "..\\secret.png"):
         (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
         with refused("outside of its folder"):
             read_mesh(folder / "a.obj", "mm")
 
 
-def test_points_of_gigabytes(tmp_path, refused):
+def test_points_of_gigabytes(tmp_path):
     model = tmp_path / "models" / "box"
     model.mkdir(parents=True)
     with (model / "points.xyz").open("wb") as file:
@@ -285,7 +285,7 @@ ARCHIVES: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
-def test_hostile_archives(name, tmp_path, refused):
+def test_hostile_archives(name, tmp_path):
     archive, folder = tmp_path / "in" / "a.tar", tmp_path / "in" / "out" / "folder"
     archive.parent.mkdir()
     archive.write_bytes(made(ARCHIVES[name]))
@@ -296,7 +296,7 @@ def test_hostile_archives(name, tmp_path, refused):
 
 
 @pytest.mark.parametrize("name", [name for name in ARCHIVES if "folder" not in name])
-def test_hostile_shards(name, tmp_path, bounded):
+def test_hostile_shards(name, tmp_path):
     """A shard is never unpacked; its hostile members are rejected or skipped."""
     path = tmp_path / "shard-000000.tar"
     path.write_bytes(made(ARCHIVES[name]))
@@ -360,7 +360,7 @@ READERS = {
 @pytest.mark.parametrize(
     ("file", "name"), [(file, name) for file, (_, table) in READERS.items() for name in table]
 )
-def test_hostile_tables_and_records(file, name, tmp_path, refused):
+def test_hostile_tables_and_records(file, name, tmp_path):
     read, table = READERS[file]
     path = tmp_path / file
     path.parent.mkdir(exist_ok=True)
@@ -390,7 +390,7 @@ ARGUMENTS = {
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_hostile_input_ends_a_command_with_one_line(name, good, tmp_path, bounded, monkeypatch):
+def test_hostile_input_ends_a_command_with_one_line(name, good, tmp_path, monkeypatch):
     arguments, files = ARGUMENTS[name]
     monkeypatch.chdir(good.parent)
     for file, content in files.items():

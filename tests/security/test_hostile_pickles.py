@@ -18,6 +18,7 @@ import torch
 from torch.utils import collect_env
 
 from dopepp.models.backbones import VGG19
+from tests.security.conftest import Call, refused, rejected
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -52,30 +53,30 @@ def write(saved):
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_os_system_anywhere(place, write, Call, canary, rejected):
+def test_os_system_anywhere(place, write, canary):
     path = write(place, Call(os.system, canary))
     rejected(path, r"bad\.ckpt, which torch cannot load .*the name 'posix\.system'")
 
 
 CALLS = {
-    "exec": lambda call, command: call(builtins.exec, f"import os; os.system({command!r})"),
-    "eval": lambda call, command: call(builtins.eval, f"__import__('os').system({command!r})"),
-    "Popen": lambda call, command: call(subprocess.Popen, command.split()),
-    "collect_env, which got through Hydra's gate": lambda call, command: call(
-        collect_env.run, command
-    ),
-    "import_module": lambda call, _: call(importlib.import_module, "antigravity"),
-    "an attribute by its name": lambda call, _: call(operator.attrgetter, "system"),
-    "setting the environment": lambda call, _: call(os.putenv, "DOPEPP_CANARY", "1"),
+    "exec": (builtins.exec, "import os; os.system({command!r})"),
+    "eval": (builtins.eval, "__import__('os').system({command!r})"),
+    "Popen": (subprocess.Popen, "{command}"),
+    "collect_env, which got through Hydra's gate": (collect_env.run, "{command}"),
+    "import_module": (importlib.import_module, "antigravity"),
+    "an attribute by its name": (operator.attrgetter, "system"),
+    "setting the environment": (os.putenv, "DOPEPP_CANARY", "1"),
 }
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_other_ways_to_run_code(name, write, Call, canary, rejected):
-    rejected(write("data", CALLS[name](Call, canary)), "which torch cannot load .*the name '")
+def test_other_ways_to_run_code(name, write, canary):
+    function, *arguments = CALLS[name]
+    call = Call(function, *(text.format(command=canary) for text in arguments))
+    rejected(write("data", call), "which torch cannot load .*the name '")
 
 
-def test_torch_load_inside_of_a_checkpoint(write, Call, canary, rejected, tmp_path):
+def test_torch_load_inside_of_a_checkpoint(write, canary, tmp_path):
     (tmp_path / "second.pkl").write_bytes(pickle.dumps(Call(os.system, canary)))
     path = write("data", Call(torch.load, str(tmp_path / "second.pkl")))
     rejected(path, r"the name 'torch\.serialization\.load'")
@@ -85,13 +86,12 @@ class Subclass(torch.Tensor):
     """A tensor of an unknown class."""
 
 
-def test_a_tensor_of_another_class(write, rejected):
-    rejected(
-        write("another weight", torch.ones(3).as_subclass(Subclass)), "which torch cannot load"
-    )
+def test_a_tensor_of_another_class(write):
+    tensor = torch.ones(3).as_subclass(Subclass)
+    rejected(write("another weight", tensor), "which torch cannot load")
 
 
-def test_methods_set_on_a_tensor(write, Call, content, rejected):
+def test_methods_set_on_a_tensor(write, content):
     """``_rebuild_from_type_v2`` sets any attribute, also an attribute that a check reads."""
     weight = content["state_dict"][first_weight(content)]
     make, arguments, *_ = weight.__reduce_ex__(2)
@@ -101,11 +101,11 @@ def test_methods_set_on_a_tensor(write, Call, content, rejected):
 
 
 BOMBS = {
-    "bytearray": lambda call: call(bytearray, SIZE),
-    "bytes": lambda call: call(bytes, SIZE),
-    "storage": lambda call: call(torch.UntypedStorage, SIZE),
-    "old tensor": lambda call: call(torch.FloatTensor, SIZE // 4),
-    "tensor larger than its storage": lambda call: call(
+    "bytearray": (bytearray, SIZE),
+    "bytes": (bytes, SIZE),
+    "storage": (torch.UntypedStorage, SIZE),
+    "old tensor": (torch.FloatTensor, SIZE // 4),
+    "tensor larger than its storage": (
         torch._utils._rebuild_tensor_v2, torch.zeros(1).untyped_storage(), 0, (SIZE // 4,), (1,),
         False, OrderedDict(),
     ),
@@ -114,33 +114,31 @@ BOMBS = {
 
 @pytest.mark.parametrize("name", BOMBS)
 @pytest.mark.parametrize("place", ["data", "optimizer state"])
-def test_a_call_that_creates_a_huge_object(name, place, write, Call, rejected):
+def test_a_call_that_creates_a_huge_object(name, place, write):
     """torch's list of safe calls includes calls that allocate any given size."""
     try:
-        path = write(place, BOMBS[name](Call))
+        path = write(place, Call(*BOMBS[name]))
     except NotImplementedError:  # torch cannot write a bare storage
         pytest.skip("cannot be written")
     assert path.stat().st_size < 1_000_000
     rejected(path, "which torch cannot load")
 
 
-def repacked(source: Path, target: Path, edit: Callable[[str, bytes], bytes]) -> Path:
-    """Copy a torch file with changed members."""
+def repacked(source: Path, target: Path, edit: Callable[[bytes], bytes]) -> Path:
+    """Copy a torch file with a changed pickle."""
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
         for name in old.namelist():
-            new.writestr(name, edit(name, old.read(name)))
+            content = old.read(name)
+            new.writestr(name, edit(content) if name.endswith(".pkl") else content)
     return target
 
 
-def test_a_storage_that_reaches_beyond_its_bytes(tmp_path, rejected):
+def test_a_storage_that_reaches_beyond_its_bytes(tmp_path):
     """Some versions of torch would read beyond the storage."""
     torch.save({"dopepp": torch.arange(200.0)}, tmp_path / "good.ckpt")
-
-    def enlarge(name, content):
-        # BININT1 200 becomes BININT2 65535, in the storage and in the tensor.
-        return content.replace(b"K\xc8", b"M\xff\xff") if name.endswith(".pkl") else content
-
-    path = repacked(tmp_path / "good.ckpt", tmp_path / "bad.ckpt", enlarge)
+    good, bad = tmp_path / "good.ckpt", tmp_path / "bad.ckpt"
+    # BININT1 200 becomes BININT2 65535, in the storage and in the tensor.
+    path = repacked(good, bad, lambda content: content.replace(b"K\xc8", b"M\xff\xff"))
     rejected(path, "a storage of 262140 bytes, but 800 bytes in the file")
 
 
@@ -170,11 +168,8 @@ OPERATIONS = {
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_operations_that_no_checkpoint_needs(name, good, tmp_path, rejected):
-    path = repacked(
-        good, tmp_path / "bad.ckpt",
-        lambda member, old: pickled(OPERATIONS[name]) if member.endswith(".pkl") else old,
-    )  # fmt: skip
+def test_operations_that_no_checkpoint_needs(name, good, tmp_path):
+    path = repacked(good, tmp_path / "bad.ckpt", lambda old: pickled(OPERATIONS[name]))
     rejected(path, r"bad\.ckpt(, which torch cannot load|, which contains a NoneType)")
 
 
@@ -192,7 +187,7 @@ def legacy(content: bytes) -> bytes:
     return magic + pickle.dumps(1001, 2) + machine + content + pickle.dumps(["0"], 2) + bytes(8)
 
 
-def test_a_legacy_file_is_no_checkpoint(tmp_path, Call, canary, rejected):
+def test_a_legacy_file_is_no_checkpoint(tmp_path, canary):
     path = tmp_path / "old.ckpt"
     torch.save({"dopepp": {}}, path, _use_new_zipfile_serialization=False)
     rejected(path, "not a torch file")
@@ -202,9 +197,7 @@ def test_a_legacy_file_is_no_checkpoint(tmp_path, Call, canary, rejected):
 
 LEGACY = {
     "code in its content": lambda call, command: legacy(pickle.dumps(call(os.system, command), 2)),
-    "code in place of its magic number": lambda call, command: pickle.dumps(
-        call(os.system, command), 2
-    ),
+    "code as its magic number": lambda call, command: pickle.dumps(call(os.system, command), 2),
     "a storage of terabytes": lambda *_: legacy(pickled(storage_reference(10**12))),
     "a storage of a negative size": lambda *_: legacy(pickled(storage_reference(-1))),
     "a call that fills the memory": lambda call, _: legacy(pickle.dumps(call(bytearray, SIZE), 2)),
@@ -212,7 +205,7 @@ LEGACY = {
 
 
 @pytest.mark.parametrize("name", LEGACY)
-def test_hostile_pretrained_weights(name, tmp_path, Call, canary, refused):
+def test_hostile_pretrained_weights(name, tmp_path, canary):
     """Pretrained weights are untrusted, and torchvision's file has the old format."""
     path = tmp_path / "vgg19.pth"
     path.write_bytes(LEGACY[name](Call, canary))

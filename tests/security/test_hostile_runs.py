@@ -4,12 +4,13 @@ import pytest
 
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment.run.resume import read_overrides
+from tests.security.conftest import bounded, refused
 
 pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.fixture
-def told(bounded, call, tmp_path, monkeypatch):
+def told(call, tmp_path, monkeypatch):
     """Run ``train.py`` or ``evaluate.py``, and return its error of one line."""
     monkeypatch.chdir(tmp_path)
 
@@ -21,18 +22,10 @@ def told(bounded, call, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def run_folder(tmp_path, good):
-    """Make a run folder to resume, with the text of its overrides."""
-
-    def make(overrides):
-        run = tmp_path / "run"
-        (run / ".hydra").mkdir(parents=True)
-        (run / "checkpoints").mkdir()
-        (run / "checkpoints" / "last.ckpt").write_bytes(good.read_bytes())
-        (run / ".hydra" / "overrides.yaml").write_text(overrides)
-        return run
-
-    return make
+def stored(tmp_path):
+    """The file of a run's overrides."""
+    (tmp_path / ".hydra").mkdir()
+    return tmp_path / ".hydra" / "overrides.yaml"
 
 
 def laughs() -> str:
@@ -66,31 +59,27 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_overrides_other_than_a_list_of_text(name, tmp_path, refused):
-    path = tmp_path / ".hydra" / "overrides.yaml"
-    path.parent.mkdir()
-    path.write_text(TEXTS[name])
+def test_overrides_other_than_a_list_of_text(name, stored, tmp_path):
+    stored.write_text(TEXTS[name])
     with refused(r"overrides\.yaml"):
         read_overrides(tmp_path)
 
 
-def test_the_files_that_hydra_writes_are_read(tmp_path):
-    path = tmp_path / ".hydra" / "overrides.yaml"
-    path.parent.mkdir()
-    path.write_text(
+def test_the_files_that_hydra_writes_are_read(stored, tmp_path):
+    overrides = ["model=dopepp", "data.parts=[a, b]", "++virtual.scene.x={a: 1}", "~logger"]
+    stored.write_text(
         "- model=dopepp\n- data.parts=[a, b]\n- '++virtual.scene.x={a: 1}'\n- ~logger\n"
     )
-    assert read_overrides(tmp_path) == [
-        "model=dopepp", "data.parts=[a, b]", "++virtual.scene.x={a: 1}", "~logger",
-    ]  # fmt: skip
-    path.write_text("a: {b: [1, 2.5, null, true]}\nc: 'x'\n")
-    assert read_yaml(path) == {"a": {"b": [1, 2.5, None, True]}, "c": "x"}
+    assert read_overrides(tmp_path) == overrides
+    stored.write_text("a: {b: [1, 2.5, null, true]}\nc: 'x'\n")
+    assert read_yaml(stored) == {"a": {"b": [1, 2.5, None, True]}, "c": "x"}
 
 
-def test_overrides_that_are_not_a_text_file(run_folder, told):
-    run = run_folder("")
-    (run / ".hydra" / "overrides.yaml").write_bytes(b"\xff\xfe\x00")
-    assert "overrides.yaml" in told("train.py", f"resume={run}")
+def test_overrides_that_are_not_a_text_file(stored, good, told, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    good.rename(tmp_path / "checkpoints" / "last.ckpt")
+    stored.write_bytes(b"\xff\xfe\x00")
+    assert "overrides.yaml" in told("train.py", f"resume={tmp_path}")
 
 
 STORED = {

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from dopepp.models.storage import MAX_HEADER_BYTES, read_safetensors, write_safetensors
+from tests.security.conftest import refused
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -69,21 +70,21 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_wrong_header(name, tmp_path, refused):
+def test_a_wrong_header(name, tmp_path):
     path = tmp_path / "a.safetensors"
     path.write_bytes(FILES[name])
     with refused(r"a\.safetensors: .*allowed: a complete safetensors file"):
         read_safetensors(path)
 
 
-def test_a_header_of_megabytes_is_not_parsed(tmp_path, refused):
+def test_a_header_of_megabytes_is_not_parsed(tmp_path):
     path = tmp_path / "a.safetensors"
     path.write_bytes(packed(b'{"a":"' + b" " * (MAX_HEADER_BYTES + 1) + b'"}', b""))
     with refused(f"a header of {MAX_HEADER_BYTES + 9} bytes, over {MAX_HEADER_BYTES}"):
         read_safetensors(path)
 
 
-def test_a_huge_file_and_paths_without_a_file(tmp_path, refused):
+def test_a_huge_file_and_paths_without_a_file(tmp_path):
     path = tmp_path / "a.safetensors"
     for place in (path, tmp_path):
         with refused(r"No such file|Is a directory"):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dopepp.parts import read_mesh
+from tests.security.conftest import bounded, refused
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -195,9 +196,7 @@ SCENES: dict[str, Any] = {  # bytes, or what makes them, where that takes long
         extensionsRequired=["KHR_draco_mesh_compression"],
     ),
     "w.glb|a scene of nothing|0 vertices": glb(scenes=[{"nodes": []}]),
-    "a.3mf|a bomb|200 MB of text": lambda: archive(
-        model=model(body(1)), bomb=bytes(200_000_000)
-    ),
+    "a.3mf|a bomb|200 MB of text": lambda: archive(model=model(body(1)), bomb=bytes(200_000_000)),
     "b.3mf|a bomb of a model|200 MB of text": lambda: archive(
         model=model(body(1)) + b" " * 200_000_000
     ),
@@ -258,7 +257,7 @@ SCENES: dict[str, Any] = {  # bytes, or what makes them, where that takes long
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_hostile_scenes(name, tmp_path, refused):
+def test_hostile_scenes(name, tmp_path):
     path = tmp_path / "deep" / name.split("|")[0]
     path.parent.mkdir()
     content = SCENES[name]
@@ -277,13 +276,13 @@ def test_hostile_scenes(name, tmp_path, refused):
         ("a.off", TRIANGLE_OFF),
     ],
 )
-def test_the_undamaged_scenes_are_read(name, content, tmp_path, bounded):
+def test_the_undamaged_scenes_are_read(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     with bounded():
         assert len(read_mesh(tmp_path / name, "mm").faces) in (1, 30, 401)
 
 
-def test_an_external_texture_of_a_glb_is_not_opened(tmp_path, refused):
+def test_an_external_texture_of_a_glb_is_not_opened(tmp_path):
     (tmp_path / "secret.png").write_bytes(png(4))
     (tmp_path / "a.glb").write_bytes(glb(images=[{"uri": "secret.png"}]))
     with refused("needs the file 'secret.png'; .* inside"):

@@ -1,12 +1,12 @@
 """``dopepp check``: correct data sets pass, and check and reader report each damage."""
 
-import io
 import json
 import logging
 import re
 import shutil
 import tarfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,16 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
+from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
-from dopepp.data.formats.bop.bop_writer import BopWriter
-from dopepp.data.formats.ndds.ndds_reader import NddsReader
-from dopepp.data.formats.ndds.ndds_writer import NddsWriter
 from dopepp.data.formats.problems import MAX_KEPT, CheckReport
 from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
-from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.geometry.camera import camera_matrix
+from tests.data.makers import LAYOUTS, edit_json, write_set, write_tar
 
 SIZE, NUM_IMAGES = 128, 3
 SIDES = np.array([60.0, 40.0, 24.0])  # mm, of both boxes
@@ -80,22 +78,13 @@ def spoil(root: Path, place: str, value: Any) -> None:
 def spoil_shard(root: Path, place: str, value: Any) -> None:
     """Damage a member of the shard's first image; the order of the members is kept."""
     name, _, keys = f"{FIRST}.{place}".partition(":")
-    members = members_of(root / SHARD)
-    members = {n: spoilt(c, keys, value) if n == name else c for n, c in members.items()}
-    write_tar(root / SHARD, [(n, c) for n, c in members.items() if c is not None])
+    members = [(n, spoilt(c, keys, value) if n == name else c) for n, c in members_of(root / SHARD)]
+    write_tar(root / SHARD, [(n, c) for n, c in members if c is not None])
 
 
-def members_of(path: Path) -> dict[str, bytes]:
+def members_of(path: Path) -> list[tuple[str, bytes]]:
     with tarfile.open(path) as archive:
-        return {info.name: archive.extractfile(info).read() for info in archive.getmembers()}
-
-
-def write_tar(path: Path, members: list[tuple[str, bytes]]) -> None:
-    with tarfile.open(path, "w") as archive:
-        for name, content in members:
-            info = tarfile.TarInfo(name)
-            info.size = len(content)
-            archive.addfile(info, io.BytesIO(content))
+        return [(info.name, archive.extractfile(info).read()) for info in archive.getmembers()]
 
 
 def times(by: float) -> Callable[[Any], Any]:
@@ -114,10 +103,6 @@ def intrinsics(fx: float, cx: float) -> list[float]:
     return [fx, 0, cx, 0, 150, 63, 0, 0, 1]
 
 
-def first_null(infos: list[Any]) -> list[Any]:
-    return [None, *infos[1:]]
-
-
 def turn(quaternion: list[float]) -> list[float]:
     turned = Rotation.from_euler("xyz", [0.2, 0.3, 0.4]) * Rotation.from_quat(quaternion)
     return turned.as_quat().tolist()
@@ -131,71 +116,51 @@ def flip_box(box: dict[str, list[float]]) -> dict[str, list[float]]:
     return {name: corner[::-1] for name, corner in box.items()}
 
 
-def in_metres(entry: dict[str, Any]) -> dict[str, Any]:
-    fields = ("cuboid", "location", "cuboid_centroid")
-    return entry | {name: times(0.01)(entry[name]) for name in fields}
-
-
-def other_masks(objects: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [entry | {"segmentation_id": 3 - entry["segmentation_id"]} for entry in objects]
-
-
 SCENE = "train_pbr/000000"
 GT, CAMERA, INFO = (f"{SCENE}/scene_{name}.json" for name in ("gt", "camera", "gt_info"))
 MODELS = "models/models_info.json"
+RGB, DEPTH = f"{SCENE}/rgb/000001.png", f"{SCENE}/depth/000002.png"
+MASK, VISIBLE = f"{SCENE}/mask/000000_00000", f"{SCENE}/mask_visib/000000_00000"
+GREY_16, DIAGONAL = NOISE[..., 0].astype(np.uint16), np.eye(SIZE, dtype=np.uint8) * 255
+ROTATION, PLACE = f"{GT}:0.0.cam_R_m2c", f"{GT}:0.1.cam_t_m2c"
+SYMMETRY, AXIS = f"{MODELS}:1.symmetries_discrete.0", f"{MODELS}:2.symmetries_continuous.0.axis"
+PLY_IN_METRES = trimesh.creation.box(SIDES / 1000).export(file_type="ply")
 BOP = {
-    "rgb cut": Case(f"{SCENE}/rgb/000001.png", half, "rgb/000001.png: image: unreadable"),
-    "rgb empty": read(f"{SCENE}/rgb/000001.png", b"", "rgb/000001.png: image: unreadable"),
-    "rgb missing": read(f"{SCENE}/rgb/000001.png", None, "rgb/000001.png: file: missing"),
-    "rgb of 16 bits": Case(
-        f"{SCENE}/rgb/000001.png", NOISE[..., 0].astype(np.uint16),
-        "rgb/000001.png: image: pixels of type I;16",
-    ),
+    "rgb cut": Case(RGB, half, "rgb/000001.png: image: unreadable"),
+    "rgb empty": read(RGB, b"", "rgb/000001.png: image: unreadable"),
+    "rgb missing": read(RGB, None, "rgb/000001.png: file: missing"),
+    "rgb of 16 bits": Case(RGB, GREY_16, "rgb/000001.png: image: pixels of type I;16"),
     "rgb without records": read(f"{SCENE}/rgb/000009.png", NOISE, "scene_camera.json: 9: missing"),
-    "depth cut": Case(f"{SCENE}/depth/000002.png", half, "depth/000002.png: image: unreadable"),
-    "depth missing": Case(f"{SCENE}/depth/000002.png", None, "depth/000002.png: file: missing"),
-    "depth size": Case(
-        f"{SCENE}/depth/000002.png", SMALL,
-        "depth/000002.png: size: 128×64 pixels; allowed: 128×128",
-    ),
-    "depth colour": Case(f"{SCENE}/depth/000002.png", NOISE, "depth/000002.png: channels: "),
-    "mask cut": read(f"{SCENE}/mask/000000_000001.png", half, "000001.png: image: unreadable"),
-    "mask missing": read(
-        f"{SCENE}/mask_visib/000000_000001.png", None, "000000_000001.png: file: missing"
-    ),
-    "mask size": Case(
-        f"{SCENE}/mask_visib/000000_000000.png", SMALL, "mask_visib/000000_000000.png: size"
-    ),
-    "mask of no object": read(
-        f"{SCENE}/mask/000000_000007.png", SMALL, "000000_000007.png: file: no object 7"
-    ),
-    "mask of another": read(
-        f"{SCENE}/mask_visib/000000_000001.png", np.eye(SIZE, dtype=np.uint8) * 255,
-        "scene_gt.json: 0[1].mask_visib:",
-    ),
+    "depth cut": Case(DEPTH, half, "depth/000002.png: image: unreadable"),
+    "depth missing": Case(DEPTH, None, "depth/000002.png: file: missing"),
+    "depth size": Case(DEPTH, SMALL, "depth/000002.png: size: 128×64 pixels; allowed: 128×128"),
+    "depth colour": Case(DEPTH, NOISE, "depth/000002.png: channels: "),
+    "mask cut": read(f"{MASK}1.png", half, "000001.png: image: unreadable"),
+    "mask missing": read(f"{VISIBLE}1.png", None, "000000_000001.png: file: missing"),
+    "mask size": Case(f"{VISIBLE}0.png", SMALL, "mask_visib/000000_000000.png: size"),
+    "mask of no object": read(f"{MASK}7.png", SMALL, "000000_000007.png: file: no object 7"),
+    "mask of another": read(f"{VISIBLE}1.png", DIAGONAL, "scene_gt.json: 0[1].mask_visib:"),
     "gt missing": read(GT, None, "scene_gt.json: file: missing"),
     "camera missing": Case(CAMERA, None, "scene_camera.json: file: missing"),
     "gt cut": Case(GT, half, "scene_gt.json: JSON: line"),
     "gt NaN": Case(GT, instead(b'"obj_id": 1', b'"obj_id": NaN'), "scene_gt.json: JSON: line"),
-
     "gt list": Case(GT, b"[]", "scene_gt.json: top level"),
     "no gt": read(f"{GT}:1", None, "scene_gt.json: 1: missing"),
     "no camera": read(f"{CAMERA}:1", None, "scene_camera.json: 1: missing"),
     "one info less": Case(f"{INFO}:1.0", None, "gt_info.json: 1: 1 objects; allowed: 2"),
     "duplicate image": read(GT, instead(b'"1": [', b'"01": [], "1": ['), "image 1 twice"),
-    "duplicate key": Case(
-        GT, instead(b'"1": [', b'"1": [], "1": ['), "scene_gt.json: JSON: key '1' twice"
-    ),
+    "duplicate key": Case(GT, instead(b'"1": [', b'"1": [], "1": ['),
+                          "scene_gt.json: JSON: key '1' twice"),
     "not an image number": Case(f"{GT}:x", [], "scene_gt.json: 'x': not an image number"),
-    "rotation scaled": Case(f"{GT}:0.0.cam_R_m2c", times(1.01), "0[0].cam_R_m2c: not a rotation"),
-    "rotation mirrored": Case(f"{GT}:0.0.cam_R_m2c", times(-1), "0[0].cam_R_m2c: not a rotation"),
-    "rotation short": Case(f"{GT}:0.0.cam_R_m2c", [1.0] * 8, "0[0].cam_R_m2c: [1.0"),
-    "rotation gone": Case(f"{GT}:0.0.cam_R_m2c", None, "0[0].cam_R_m2c: missing"),
-    "rotation of words": Case(f"{GT}:0.0.cam_R_m2c", ["a"] * 9, "0[0].cam_R_m2c: ['a'"),
-    "behind": read(f"{GT}:0.1.cam_t_m2c", [0.0, 0, -400], "0[1].cam_t_m2c.z: behind the camera"),
+    "rotation scaled": Case(ROTATION, times(1.01), "0[0].cam_R_m2c: not a rotation"),
+    "rotation mirrored": Case(ROTATION, times(-1), "0[0].cam_R_m2c: not a rotation"),
+    "rotation short": Case(ROTATION, [1.0] * 8, "0[0].cam_R_m2c: [1.0"),
+    "rotation gone": Case(ROTATION, None, "0[0].cam_R_m2c: missing"),
+    "rotation of words": Case(ROTATION, ["a"] * 9, "0[0].cam_R_m2c: ['a'"),
+    "behind": read(PLACE, [0.0, 0, -400], "0[1].cam_t_m2c.z: behind the camera"),
     "metres": read(f"{GT}:2.0.cam_t_m2c", times(0.001), "2[0].cam_t_m2c.unit:"),
-    "moved": read(f"{GT}:0.1.cam_t_m2c", [90.0, 0.0, 340.0], "0[1].box: visible at"),
-    "too near": read(f"{GT}:0.1.cam_t_m2c", times(0.25), "0[1].box: "),
+    "moved": read(PLACE, [90.0, 0.0, 340.0], "0[1].box: visible at"),
+    "too near": read(PLACE, times(0.25), "0[1].box: "),
     "object of words": Case(f"{GT}:0.0.obj_id", "9", "0[0].obj_id: '9'"),
     "huge number": Case(f"{GT}:0.0.cam_t_m2c", [10**400, 0, 0], "0[0].cam_t_m2c:"),
     "object no record": Case(f"{GT}:0.0", 5, "0[0]: 5"),
@@ -213,18 +178,11 @@ BOP = {
     "box short": read(f"{INFO}:0.1.bbox_obj", [0], "0[1].bbox_obj: [0]"),
     "diameter in m": read(f"{MODELS}:1.diameter", times(0.001), "1.unit: 0.0"),
     "diameter and box": read(f"{MODELS}:1.diameter", times(2), "1.diameter: 1"),
-    "symmetry": Case(
-        f"{MODELS}:1.symmetries_discrete.0", times(2), "1.symmetries_discrete[0]: not a rotation"
-    ),
-    "axis": Case(
-        f"{MODELS}:2.symmetries_continuous.0.axis", times(0),
-        "2.symmetries_continuous[0].axis: zero",
-    ),
+    "symmetry": Case(SYMMETRY, times(2), "1.symmetries_discrete[0]: not a rotation"),
+    "axis": Case(AXIS, times(0), "2.symmetries_continuous[0].axis: zero"),
     "model cut": read("models/obj_000002.ply", b"ply\n", "obj_000002.ply: mesh: with no PLY"),
-    "model in m": read(
-        "models/obj_000001.ply", trimesh.creation.box(SIDES / 1000).export(file_type="ply"),
-        "models/obj_000001.ply: mesh: part 'obj_000001' with a diameter of 7.6e-05",
-    ),
+    "model in m": read("models/obj_000001.ply", PLY_IN_METRES, "models/obj_000001.ply: mesh: part "
+                       "'obj_000001' with a diameter of 7.6e-05"),
 }  # fmt: skip
 
 FIRST, SHARD = "000000_000000", "train_pbr/shard-000000.tar"
@@ -247,7 +205,10 @@ WEBDATASET = {
 }
 
 OBJECT, RECORD = "000000.json:objects.0", "000000.json:camera_data"
-SETTINGS = "_object_settings.json"
+SETTINGS, BOX = "_object_settings.json", f"{OBJECT}.bounding_box"
+QUATERNION, LOCATION = f"{OBJECT}.quaternion_xyzw", f"{OBJECT}.location"
+NINES = np.full((SIZE, SIZE), 9, np.uint8)
+LENGTHS = ("cuboid", "location", "cuboid_centroid")
 NDDS = {
     "image cut": Case("000001.png", half, "000001.png: image: unreadable"),
     "image missing": read("000001.png", None, "000001.json: image: missing"),
@@ -256,68 +217,51 @@ NDDS = {
     "depth size": Case("000001.depth.png", SMALL, "000001.depth.png: size: 128×64"),
     "seg missing": read("000001.seg.png", None, "000001.seg.png: file: missing"),
     "seg size": Case("000001.seg.png", SMALL, "000001.seg.png: size"),
-    "seg of nobody": read(
-        "000001.seg.png", np.full((SIZE, SIZE), 9, np.uint8), "000001.seg.png: values: [9]"
-    ),
+    "seg of nobody": read("000001.seg.png", NINES, "000001.seg.png: values: [9]"),
     "annotation missing": read("000001.json", None, "000001.png: annotation: missing: no 000001.j"),
     "annotation cut": Case("000001.json", half, "000001.json: JSON: line"),
-
     "annotation list": Case("000001.json", b"[]", "000001.json: top level"),
     "no objects": Case("000000.json:objects", None, "000000.json: objects: missing"),
-    "object no record": Case(
-        "000000.json:objects", lambda objects: [*objects, 3], "000000.json: objects[2]: 3"
-    ),
-    "NaN": read(f"{OBJECT}.location", [float("nan"), 0, 40], "objects[0].location: not finite"),
-
+    "object no record": Case("000000.json:objects", lambda objects: [*objects, 3],
+                             "000000.json: objects[2]: 3"),
+    "NaN": read(LOCATION, [float("nan"), 0, 40], "objects[0].location: not finite"),
     "unknown class": read(f"{OBJECT}.class", "ball", "objects[0].class: unknown object 'ball'"),
     "class of number": Case(f"{OBJECT}.class", 5, "objects[0].class: 5"),
-    "no rotation": read(f"{OBJECT}.quaternion_xyzw", times(1.1), "quaternion_xyzw: norm"),
-    "zero rotation": Case(f"{OBJECT}.quaternion_xyzw", times(0), "quaternion_xyzw: norm"),
-    "short rotation": Case(f"{OBJECT}.quaternion_xyzw", [1, 0], "[0].quaternion_xyzw: [1, 0]"),
-    "no location": Case(f"{OBJECT}.location", None, "objects[0].location: missing"),
-    "location of words": Case(f"{OBJECT}.location", ["a", "b", "c"], "objects[0].location: ['a'"),
-    "another rotation": read(
-        f"{OBJECT}.quaternion_xyzw", turn, "[0].quaternion_xyzw: not the cuboid's orientation"
-    ),
-    "another order": read(
-        f"{OBJECT}.quaternion_xyzw", roll, "[0].quaternion_xyzw: w, x, y, z; 5 objects"
-    ),
-    "behind": read(f"{OBJECT}.location", [0, 0, -40], "objects[0].location.z: behind the camera"),
-    "metres": read(f"{OBJECT}.location", times(0.01), "objects[0].location.unit: "),
-    "millimetres": read(f"{OBJECT}.location", times(10), "objects[0].location.unit: "),
-    "cuboid in m": read(OBJECT, in_metres, "objects[0].cuboid.unit: edges"),
-    "cuboid of another": read(
-        f"{SETTINGS}:exported_objects.0.cuboid_dimensions", [9, 4, 2],
-        "objects[0].cuboid.size: edges",
-    ),
+    "no rotation": read(QUATERNION, times(1.1), "quaternion_xyzw: norm"),
+    "zero rotation": Case(QUATERNION, times(0), "quaternion_xyzw: norm"),
+    "short rotation": Case(QUATERNION, [1, 0], "[0].quaternion_xyzw: [1, 0]"),
+    "no location": Case(LOCATION, None, "objects[0].location: missing"),
+    "location of words": Case(LOCATION, ["a", "b", "c"], "objects[0].location: ['a'"),
+    "another rotation": read(QUATERNION, turn, "[0].quaternion_xyzw: not the cuboid's orientation"),
+    "another order": read(QUATERNION, roll, "[0].quaternion_xyzw: w, x, y, z; 5 objects"),
+    "behind": read(LOCATION, [0, 0, -40], "objects[0].location.z: behind the camera"),
+    "metres": read(LOCATION, times(0.01), "objects[0].location.unit: "),
+    "millimetres": read(LOCATION, times(10), "objects[0].location.unit: "),
+    "cuboid in m": read(OBJECT, lambda entry: entry | {n: times(0.01)(entry[n]) for n in LENGTHS},
+                        "objects[0].cuboid.unit: edges"),
+    "cuboid of another": read(f"{SETTINGS}:exported_objects.0.cuboid_dimensions", [9, 4, 2],
+                              "objects[0].cuboid.size: edges"),
     "cuboid no box": read(f"{OBJECT}.cuboid.3.0", 99.0, "objects[0].cuboid: not a box"),
     "cuboid short": Case(f"{OBJECT}.cuboid", [[1, 2, 3]], "objects[0].cuboid: [[1, 2, 3]]"),
     "cuboid order": read(f"{OBJECT}.cuboid", lambda corners: corners[::-1], "objects[0]."),
     "centroid": read(f"{OBJECT}.cuboid_centroid", [0, 0, 40], "objects[0].cuboid_centroid: "),
     "projection": read(f"{OBJECT}.projected_cuboid.0.0", 0.0, "objects[0].projected_cuboid: "),
-    "projected centroid": read(
-        f"{OBJECT}.projected_cuboid_centroid", [0, 0], "objects[0].projected_cuboid_centroid: "
-    ),
-    "pose transform": read(
-        f"{OBJECT}.pose_transform.0.0", 5.0, "objects[0].pose_transform: not a rotation"
-    ),
-    "pose transform place": read(
-        f"{OBJECT}.pose_transform.3.0", 5.0, "objects[0].pose_transform: translation"
-    ),
+    "projected centroid": read(f"{OBJECT}.projected_cuboid_centroid", [0, 0],
+                               "objects[0].projected_cuboid_centroid: "),
+    "pose transform": read(f"{OBJECT}.pose_transform.0.0", 5.0,
+                           "objects[0].pose_transform: not a rotation"),
+    "pose transform place": read(f"{OBJECT}.pose_transform.3.0", 5.0,
+                                 "objects[0].pose_transform: translation"),
     "visibility": Case(f"{OBJECT}.visibility", 4, "objects[0].visibility: 4"),
     "visibility of words": Case(f"{OBJECT}.visibility", "much", "objects[0].visibility: 'much'"),
-    "bounding box": read(
-        f"{OBJECT}.bounding_box", {"top_left": [0, 0], "bottom_right": [9, 9]},
-        "objects[0].bounding_box: (0, 0)–(9, 9) does not contain",
-    ),
-    "bounding box turned": read(
-        f"{OBJECT}.bounding_box", {"top_left": [9, 9], "bottom_right": [0, 0]},
-        "objects[0].bounding_box: top_left",
-    ),
-    "bounding box order": read(
-        f"{OBJECT}.bounding_box", flip_box, "objects[0].bounding_box: column, row; 5 objects"
-    ),
-    "mask of another": read("000000.json:objects", other_masks, "objects[0].box: visible at"),
+    "bounding box": read(BOX, {"top_left": [0, 0], "bottom_right": [9, 9]},
+                         "objects[0].bounding_box: (0, 0)–(9, 9) does not contain"),
+    "bounding box turned": read(BOX, {"top_left": [9, 9], "bottom_right": [0, 0]},
+                                "objects[0].bounding_box: top_left"),
+    "bounding box order": read(BOX, flip_box, "objects[0].bounding_box: column, row; 5 objects"),
+    "mask of another": read("000000.json:objects", lambda objects: [
+        entry | {"segmentation_id": 3 - entry["segmentation_id"]} for entry in objects
+    ], "objects[0].box: visible at"),
     "ids twice": read(f"{OBJECT}.segmentation_id", 2, "objects.segmentation_id: 2 twice"),
     "instances twice": read(f"{OBJECT}.instance_id", 2, "objects.instance_id: 2 twice"),
     "principal point": read(f"{RECORD}.intrinsics.cx", 999, "camera_data.intrinsics: K with"),
@@ -325,27 +269,18 @@ NDDS = {
     "aspect": read(f"{RECORD}.intrinsics.fx", 450, "camera_data.intrinsics: "),
     "size": read(f"{RECORD}.width", 640, "camera_data.size: 640×128; the image has 128×128"),
     "settings cut": Case(SETTINGS, half, f"{SETTINGS}: JSON"),
-    "settings class": read(
-        f"{SETTINGS}:exported_objects.1", None,
-        f"{SETTINGS}: exported_objects: no entry for class 'obj_000002'",
-    ),
+    "settings class": read(f"{SETTINGS}:exported_objects.1", None,
+                           f"{SETTINGS}: exported_objects: no entry for class 'obj_000002'"),
 }  # fmt: skip
 
-LAYOUTS = {
-    "BOP": (BOP, BopWriter, spoil, lambda root, parts: BopReader(root, parts, "train_pbr")),
-    "BOP-WebDataset": (
-        WEBDATASET, WebdatasetWriter, spoil_shard,
-        lambda root, parts: WebdatasetReader(root, parts, "train_pbr"),
-    ),
-    "NDDS": (NDDS, NddsWriter, spoil, NddsReader),
-}  # fmt: skip
+DAMAGES = {"BOP": (BOP, spoil), "BOP-WebDataset": (WEBDATASET, spoil_shard), "NDDS": (NDDS, spoil)}
 
 
 @pytest.fixture(scope="session")
-def good_sets(tmp_path_factory, boxes, write_set):
+def good_sets(tmp_path_factory, boxes):
     """A correct data set of each layout with a writer; tests change copies only."""
     root = tmp_path_factory.mktemp("good")
-    for layout, (_, writer, _, _) in LAYOUTS.items():
+    for layout, (writer, _) in LAYOUTS.items():
         write_set(writer, root / layout, *boxes)
     return root
 
@@ -362,17 +297,15 @@ def copy_of(good_sets, tmp_path):
 def test_a_correct_data_set_has_no_defects_at_any_level(good_sets, layout, below):
     for folder in below:
         report = check_dataset(good_sets / layout / folder)
-        expected = (layout, NUM_IMAGES, [], [])
-        assert (report.layout, report.num_images, report.defects, report.notes) == expected
-        assert report.ok
+        found = (report.layout, report.num_images, report.defects, report.notes, report.ok)
+        assert found == (layout, NUM_IMAGES, [], [], True)
 
 
 def assert_found(root: Path, *expected: str) -> None:
     """Check that the defects contain each damage with its file and field."""
     report = check_dataset(root)
-    lines = report.defects
     for text in expected:
-        assert any(text in line for line in lines), (text, lines)
+        assert any(text in line for line in report.defects), (text, report.defects)
     assert not report.ok
 
 
@@ -393,16 +326,15 @@ def assert_refused(make_reader: Callable[[], Any], expected: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("layout", "name"),
-    [(layout, name) for layout, (table, *_) in LAYOUTS.items() for name in table],
+    ("layout", "name"), [(layout, name) for layout, (table, _) in DAMAGES.items() for name in table]
 )
 def test_check_and_reader_report_every_damage_with_file_and_field(copy_of, boxes, layout, name):
-    table, _, damage, make_reader = LAYOUTS[layout]
-    case, root = table[name], copy_of(layout)
+    (table, damage), root = DAMAGES[layout], copy_of(layout)
+    case = table[name]
     damage(root, case.place, case.value)
     assert_found(root, case.found)
     if not case.is_read:
-        assert_refused(lambda: make_reader(root, boxes[0]), f"{case.found}: ")
+        assert_refused(partial(LAYOUTS[layout][1], root, boxes[0]), f"{case.found}: ")
 
 
 INDEPENDENT = [
@@ -418,7 +350,7 @@ INDEPENDENT = [
 
 @pytest.mark.parametrize(("layout", "names"), INDEPENDENT)
 def test_every_defect_is_reported(copy_of, layout, names):
-    table, root = LAYOUTS[layout][0], copy_of(layout)
+    table, root = DAMAGES[layout][0], copy_of(layout)
     for name in names:
         spoil(root, table[name].place, table[name].value)
     assert_found(root, *(table[name].found for name in names))
@@ -429,7 +361,7 @@ NOTED = {
     "an image without info": (f"{INFO}:1", None, "2 objects without visib_fract"),
     "no info at all": (INFO, None, "6 objects without visib_fract"),
     "an image of empty info": (f"{INFO}:1", [], "2 objects without visib_fract"),
-    "an object of null info": (f"{INFO}:1", first_null, "1 objects without visib_fract"),
+    "an object of null info": (f"{INFO}:1.0", lambda info: None, "1 objects without visib_fract"),
     "an object of a box only": (f"{INFO}:0.0.visib_fract", None, "1 objects without visib_fract"),
     "a model missing": ("models/obj_000002.ply", None, "no file of object 2, whose annotations"),
     "an object without a model": (f"{GT}:0.0.obj_id", 9, "object 9 is annotated 1 times and has"),
@@ -508,8 +440,8 @@ LISTS = {
     "archive: member '../evil.rgb.png'": lambda members: [("../evil.rgb.png", b"x"), *members],
     f"{FIRST}.gt.json' twice": lambda members: [*members, (f"{FIRST}.gt.json", b"[]")],
     f"{FIRST}: key: its members are not together": lambda members: [*members[1:], members[0]],
-    "key_to_shard.json: 9_9: missing": lambda members: [
-        *members, *((n.replace(FIRST, "9_9"), c) for n, c in members if n.startswith(FIRST))
+    "key_to_shard.json: 9_9: missing": lambda members: members + [
+        (name.replace(FIRST, "9_9"), content) for name, content in members if FIRST in name
     ],
 }  # fmt: skip
 
@@ -517,14 +449,14 @@ LISTS = {
 @pytest.mark.parametrize("expected", LISTS)
 def test_members_out_of_order_are_reported(copy_of, expected):
     root = copy_of("BOP-WebDataset")
-    write_tar(root / SHARD, LISTS[expected](list(members_of(root / SHARD).items())))
+    write_tar(root / SHARD, LISTS[expected](members_of(root / SHARD)))
     assert_found(root, expected)
 
 
 def test_defects_in_a_damaged_archive_are_reported(copy_of):
     root = copy_of("BOP-WebDataset")
     spoil_shard(root, "gt.json:0.cam_t_m2c", [0, 0, -1])
-    members = list(members_of(root / SHARD).items())
+    members = members_of(root / SHARD)
     members[2:2] = [("../evil.txt", b"x"), members[0]]
     write_tar(root / SHARD, members)
     (root / "train_pbr" / "shard-000001.tar").write_bytes(b"\x1f\x8b" + bytes(600))
@@ -545,22 +477,23 @@ def test_conventions_of_a_whole_data_set_are_notes(copy_of, field, change, note)
     assert (report.defects, report.notes) == ([], [f"{field}: {note} (6 objects)"])
 
 
+def of_old_nvisii(record: dict[str, Any]) -> None:
+    """Turn y up and z backwards; keep projections and no cuboid in space."""
+    for entry in record["objects"]:
+        entry["location"] = (np.array([1, -1, -1]) * entry["location"] / 100).tolist()
+        rotation = Rotation.from_quat(entry["quaternion_xyzw"]).as_matrix()
+        turned = Rotation.from_matrix(np.diag([1, -1, -1]) @ rotation)
+        entry["quaternion_xyzw"] = turned.as_quat().tolist()
+        entry["projected_cuboid"].append(entry.pop("projected_cuboid_centroid"))
+        for field in ("cuboid", "cuboid_centroid", "pose_transform", "bounding_box"):
+            del entry[field]
+
+
 def test_opengl_files_without_cuboids_have_no_defects(copy_of):
-    """Files of old nvisii: y up, z backwards, projections and no cuboid in space."""
     root = copy_of("NDDS")
     (root / SETTINGS).unlink()
     for path in root.glob("0*.json"):
-        content = json.loads(path.read_text())
-        for entry in content["objects"]:
-            x, y, z = entry["location"]
-            entry["location"] = [x / 100, -y / 100, -z / 100]
-            rotation = Rotation.from_quat(entry["quaternion_xyzw"]).as_matrix()
-            turned = Rotation.from_matrix(np.diag([1, -1, -1]) @ rotation)
-            entry["quaternion_xyzw"] = turned.as_quat().tolist()
-            entry["projected_cuboid"].append(entry.pop("projected_cuboid_centroid"))
-            for field in ("cuboid", "cuboid_centroid", "pose_transform", "bounding_box"):
-                del entry[field]
-        path.write_text(json.dumps(content))
+        edit_json(path, of_old_nvisii)
     report = check_dataset(root)
     assert (report.defects, report.notes) == ([], ["camera axes: OpenGL (6 objects)"])
 
@@ -612,6 +545,11 @@ def file(what: str, value: Any) -> Callable[[Any], Any]:
     return lambda tree: spoil(tree.root, f"data/{FRAME}-{what}", value)
 
 
+def names(kind: str, *lines: str) -> Callable[[Any], Any]:
+    return lambda tree: tree.write_list(kind, list(lines))
+
+
+OTHER_K = camera_matrix(100.0, 100.0, 999.0, 35.0)
 YCB_VIDEO = {
     "colour cut": (file("color.png", half), "color.png: image: of "),
     "depth missing": (file("depth.png", None), "depth.png: file: missing"),
@@ -630,39 +568,28 @@ YCB_VIDEO = {
     "no factor": (meta(factor_depth=None), "meta.mat: factor_depth: missing"),
     "factor": (meta(factor_depth=-1), "meta.mat: factor_depth: -1"),
     "K NaN": (meta(intrinsic_matrix=np.full((3, 3), np.nan)), "intrinsic_matrix: not finite"),
-    "list": (
-        lambda tree: tree.write_list("train", ["0000/x"]), "image_sets/train.txt: line: line '0000"
-    ),
-}  # fmt: skip
+    "list": (names("train", "0000/x"), "image_sets/train.txt: line: line '0000"),
+}
 """Damages that the check reports and the reader rejects."""
 
 YCB_VIDEO_READ = {
     "colour missing": (file("color.png", None), "color.png: file: missing"),
     "colour of another kind": (file("color.png", SMALL), "color.png: image: of shape (64, 128)"),
     "meta empty": (file("meta.mat", b""), "meta.mat: file: damaged"),
-    "label of nobody": (
-        file("label.png", np.full((72, 96), 3, np.uint8)),
-        "label.png: values: classes [3] without a pose",
-    ),
+    "label of nobody": (file("label.png", np.full((72, 96), 3, np.uint8)),
+                        "label.png: values: classes [3] without a pose"),
     "mirrored": (poses(R22=-1), "determinant -1"),
     "millimetres": (poses(tz=300.0), "meta.mat: poses[0].unit: "),
     "moved": (poses(tx=0.1), "meta.mat: poses[0].box: visible at"),
     "unknown class": (meta(cls_indexes=[[9]]), "cls_indexes[0]: unknown class 9"),
-    "K": (
-        meta(intrinsic_matrix=camera_matrix(100.0, 100.0, 999.0, 35.0)),
-        "meta.mat: intrinsic_matrix: K",
-    ),
+    "K": (meta(intrinsic_matrix=OTHER_K), "meta.mat: intrinsic_matrix: K"),
     "box of words": (file("box.txt", b"003_box a b c d\n"), "box.txt: line 1: '003_box a"),
     "box of nobody": (file("box.txt", b"x 1 2 3 4\n"), "box.txt: line 1: unknown object 'x'"),
     "box turned": (file("box.txt", b"003_box 9 9 2 2\n"), "box.txt: line 1: '003_box 9"),
     "box outside": (file("box.txt", b"003_box 300 9 400 20\n"), "outside the 96×72 image"),
-    "points": (
-        lambda tree: (tree.root / "models/003_box/points.xyz").write_text("1 2\n"),
-        "models/003_box/points.xyz: points: ",
-    ),
-    "class list": (
-        lambda tree: tree.write_list("classes", ["003_box", "003_box"]), "classes.txt: names: "
-    ),
+    "points": (lambda tree: spoil(tree.root, "models/003_box/points.xyz", b"1 2\n"),
+               "models/003_box/points.xyz: points: "),
+    "class list": (names("classes", "003_box", "003_box"), "classes.txt: names: "),
 }  # fmt: skip
 """Damages that only the check reports, or the reader reports with another message."""
 
@@ -674,7 +601,7 @@ def test_check_and_reader_report_every_damage_of_ycb_video(ycb, box, name):
     assert_found(ycb.root, expected)
     assert check_dataset(ycb.root).num_images == 3
     if name in YCB_VIDEO:
-        assert_refused(lambda: YcbVideoReader(ycb.root, [box], "train"), expected)
+        assert_refused(partial(YcbVideoReader, ycb.root, [box], "train"), expected)
 
 
 def test_every_defect_of_a_frame_is_reported(ycb):
@@ -720,3 +647,53 @@ def test_report_lines_are_capped_and_counted(tmp_path, caplog):
         for _ in range(1000):
             report.count_image()
     assert "1000 images checked, 10005 defects" in caplog.text
+
+
+def make(root, *names):
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+
+
+SCENE_FILE = "train_pbr/000000/scene_gt.json"
+NDDS_FILES = ("000000.json", "000000.png", "_object_settings.json")
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (
+            [f"bracket/{SCENE_FILE}", *(f"plate/{name}" for name in NDDS_FILES)],
+            r"2 data sets: bracket \(BOP\), plate \(NDDS\)",
+        ),
+        ([f"bracket/{SCENE_FILE}"], r"1 data sets: bracket \(BOP\)"),
+        (
+            [f"{item}/{name}" for item in "ab" for name in (*NDDS_FILES, RECORD_FILE)],
+            r"2 data sets: a \(NDDS\), b \(NDDS\)",
+        ),
+        (
+            [f"set{n}/{SCENE_FILE}" for n in range(10)],
+            r"10 data sets: set0 .*set7 \(BOP\) and 2 more",
+        ),
+    ],
+)
+def test_a_folder_of_data_sets_is_rejected(names, found, tmp_path):
+    make(tmp_path, *names)
+    first = min(name.split("/")[0] for name in names)
+    with pytest.raises(UserError, match=found) as error:
+        check_dataset(tmp_path)
+    assert error.value.fix.endswith(f"dopepp check {tmp_path / first}")
+
+
+def test_folders_of_scenes_are_one_data_set(tmp_path):
+    for scene in ("kitchen_0", "forest_1"):
+        make(tmp_path, *(f"{scene}/{name}" for name in NDDS_FILES))
+    assert check_dataset(tmp_path).layout == "NDDS"
+
+
+@pytest.mark.parametrize("names", [[], ["notes/readme.txt"]])
+def test_a_folder_of_unknown_layout_is_rejected(names, tmp_path):
+    make(tmp_path, *names)
+    with pytest.raises(UserError, match="a folder with an unknown layout"):
+        check_dataset(tmp_path)

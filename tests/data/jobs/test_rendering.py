@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from concurrent.futures import Future
+from functools import partial
 from io import StringIO
 from pathlib import Path
 
@@ -22,13 +23,8 @@ from dopepp.core.pool import PickledFunction, Pool, unpickle_answer
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.ndds_writer import NddsWriter
 from dopepp.data.render_job import WRITERS, make_job, named_part
-from dopepp.data.render_run import (
-    ProgressDisplay,
-    RenderReport,
-    Shard,
-    plan_chunks,
-    render_dataset,
-)
+from dopepp.data.render_run import ProgressDisplay, RenderReport, Shard, plan_chunks, render_dataset
+from tests.data.makers import contents, small_job
 
 NUM = 10
 
@@ -68,12 +64,12 @@ def layout(request):
 
 
 @pytest.fixture(scope="module")
-def job(layout, small_job):
+def job(layout):
     return small_job(layout)
 
 
 @pytest.fixture(scope="module")
-def whole(job, contents, tmp_path_factory):
+def whole(job, tmp_path_factory):
     """The files of a job that ran without an interruption."""
     root = tmp_path_factory.mktemp("whole")
     report = render_dataset(job, root, NUM, InlinePool)
@@ -81,26 +77,24 @@ def whole(job, contents, tmp_path_factory):
     return contents(root)
 
 
-def test_an_interrupted_job_writes_the_same_files(job, tmp_path, contents, whole):
+def test_an_interrupted_job_writes_the_same_files(job, tmp_path, whole):
     for dies_after in (0, 2, 3):
         with pytest.raises(KeyboardInterrupt):
-            render_dataset(job, tmp_path, NUM, lambda work: InlinePool(work, dies_after))  # noqa: B023
-    last = render_dataset(job, tmp_path, NUM, InlinePool)
-    assert 0 < last.num_rendered < NUM
+            render_dataset(job, tmp_path, NUM, partial(InlinePool, dies_after=dies_after))
+    assert 0 < render_dataset(job, tmp_path, NUM, InlinePool).num_rendered < NUM
     assert contents(tmp_path) == whole
     again = render_dataset(job, tmp_path, NUM, InlinePool)
-    assert again.num_rendered == 0
-    assert str(again) == f"all {NUM} images exist already"
+    assert (again.num_rendered, str(again)) == (0, f"all {NUM} images exist already")
     assert contents(tmp_path) == whole
 
 
-def test_a_job_can_be_extended(job, tmp_path, contents, whole):
+def test_a_job_can_be_extended(job, tmp_path, whole):
     for num in (2, 5, 3, NUM):
         render_dataset(job, tmp_path, num, InlinePool)
     assert contents(tmp_path) == whole
 
 
-def test_simultaneous_shards_share_a_folder(job, tmp_path, contents, whole):
+def test_simultaneous_shards_share_a_folder(job, tmp_path, whole):
     # Shards begin and end within chunks; the last shard of a chunk finalizes it.
     others = []
 
@@ -115,7 +109,7 @@ def test_simultaneous_shards_share_a_folder(job, tmp_path, contents, whole):
     assert contents(tmp_path) == whole
 
 
-def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, contents, whole):
+def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, whole):
     for number in range(2):  # each finalizes a chunk of its own, and they share one
         render_dataset(job, tmp_path / str(number), NUM, InlinePool, Shard(number, 2))
         shutil.copytree(tmp_path / str(number), tmp_path / "merged", dirs_exist_ok=True)
@@ -123,32 +117,30 @@ def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, content
     assert contents(tmp_path / "merged") == whole
 
 
-def test_a_full_disk_gives_one_line_and_no_partial_file(
-    job, tmp_path, monkeypatch, contents, whole
-):
+def test_a_full_disk_is_one_line_and_no_partial_file(job, tmp_path, monkeypatch, whole):
     # Enough space for the parts' meshes and for half of the other files.
     write = Path.write_bytes
     room = [sum(len(whole[name]) for name in whole if not name.startswith("models")) // 2]
 
     def write_what_fits(path, content):
         room[0] -= 0 if path.parent.name == "models" else len(content)
-        if room[0] < 0:
-            write(path, content[: len(content) // 2])
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-        return write(path, content)
+        if room[0] >= 0:
+            return write(path, content)
+        write(path, content[: len(content) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", write_what_fits)
-        message = rf"no space left for {tmp_path}: .* run the same command again"
-        with pytest.raises(StoppedError, match=message):
-            render_dataset(job, tmp_path, NUM, InlinePool)
+    monkeypatch.setattr(Path, "write_bytes", write_what_fits)
+    message = rf"no space left for {tmp_path}: .* run the same command again"
+    with pytest.raises(StoppedError, match=message):
+        render_dataset(job, tmp_path, NUM, InlinePool)
+    monkeypatch.undo()
     assert len(contents(tmp_path)) > 2
     assert not list(tmp_path.rglob("*.partial"))
     assert 0 < render_dataset(job, tmp_path, NUM, InlinePool).num_rendered < NUM
     assert contents(tmp_path) == whole
 
 
-def test_another_job_in_the_folder_is_rejected_with_the_field(tmp_path, small_job, contents):
+def test_another_job_in_the_folder_is_rejected_with_the_field(tmp_path):
     render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)
     before = contents(tmp_path)
     for change, field in (
@@ -164,29 +156,27 @@ def test_another_job_in_the_folder_is_rejected_with_the_field(tmp_path, small_jo
     assert contents(tmp_path) == before
 
 
-def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
+def test_changed_photos_and_meshes_are_another_job(tmp_path):
     photos, mesh = tmp_path / "photos", tmp_path / "box.stl"
     photos.mkdir()
-    image = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
 
-    def write_mesh(scale):
+    def add_photo(name):
+        image = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
+        cv2.imwrite(str(photos / name), image)
+
+    def render(scale=1.0, unit="mm"):
         trimesh.creation.box(np.array([90, 80, 70]) * scale).export(mesh)
-
-    def render(unit="mm"):
         options = {"preset": "quickstart", "size": "32x24", "layout": "ndds", "unit": unit}
         job = make_job([str(mesh)], backgrounds=photos, **options)
         render_dataset(job, tmp_path / "out", 1, InlinePool)
 
-    write_mesh(1)
-    cv2.imwrite(str(photos / "a.png"), image)
+    add_photo("a.png")
     render()
-    write_mesh(1.1)
     with pytest.raises(UserError, match=r"parts\[0\]\.diameter is 0\.139.* there and 0\.153.* now"):
-        render()
-    write_mesh(1)
+        render(1.1)
     with pytest.raises(UserError, match='unit is "mm" there and "cm" now'):
-        render("cm")
-    cv2.imwrite(str(photos / "b.png"), image)
+        render(unit="cm")
+    add_photo("b.png")
     with pytest.raises(UserError, match=r'backgrounds\[1\] is "1" there and "2" now'):
         render()
 
@@ -194,20 +184,20 @@ def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
 @pytest.mark.parametrize(
     "content", ["", "[1]", '{"seed": NaN}', '{"seed": 1, "seed": 2}', "[" * 100_000, "{}"]
 )
-def test_a_damaged_record_is_a_user_error(content, tmp_path, small_job):
+def test_a_damaged_record_is_a_user_error(content, tmp_path):
     (tmp_path / RECORD_FILE).write_text(content)
     with pytest.raises(UserError, match=RECORD_FILE):
         render_dataset(small_job(), tmp_path, 2, InlinePool)
 
 
-def test_a_folder_of_other_files_is_rejected(tmp_path, small_job):
+def test_a_folder_of_other_files_is_rejected(tmp_path):
     (file := tmp_path / "thesis.pdf").touch()
     for folder, message in (tmp_path, r"holds 'thesis\.pdf' and no"), (file / "x", "Not a dir"):
         with pytest.raises(UserError, match=message):
             render_dataset(small_job(), folder, 2, InlinePool)
 
 
-def test_only_abandoned_partial_files_are_removed(tmp_path, small_job):
+def test_only_abandoned_partial_files_are_removed(tmp_path):
     job = small_job("ndds")
     render_dataset(job, tmp_path, 2, InlinePool)
     mine = partial_path(tmp_path / "000009.png")
@@ -274,27 +264,26 @@ def test_invalid_changes_are_rejected(changes, message):
         make_job(["servoholder"], changes=changes)
 
 
-def test_changes_reach_the_preset(small_job):
-    preset = small_job(changes=["lighting.num_lights=[2,3]", "min_visible_fraction=0.25"])
-    assert preset.factory.preset.lighting.num_lights == (2, 3)
-    assert preset.factory.preset.min_visible_fraction == 0.25
-    assert tuple(preset.record["preset"]["lighting"]["num_lights"]) == (2, 3)
-    json.dumps(preset.record, allow_nan=False)
+def test_changes_reach_the_preset():
+    job = small_job(changes=["lighting.num_lights=[2,3]", "min_visible_fraction=0.25"])
+    preset = job.factory.preset
+    assert (preset.lighting.num_lights, preset.min_visible_fraction) == ((2, 3), 0.25)
+    assert tuple(job.record["preset"]["lighting"]["num_lights"]) == (2, 3)
+    json.dumps(job.record, allow_nan=False)
 
 
-def test_an_internal_error_keeps_its_traceback(tmp_path, monkeypatch, small_job):
+def test_an_internal_error_keeps_its_traceback(tmp_path, monkeypatch):
     monkeypatch.setattr(NddsWriter, "write", lambda *_: dict[str, str]()["defect"])
     with pytest.raises(RuntimeError, match=r"(?s)test_rendering\.py.*KeyError: 'defect'"):
         render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)
 
 
 def test_the_bar_shows_count_rate_and_time_left():
-    console = Console(file=StringIO(), force_terminal=True, width=120)
-    with ProgressDisplay(console) as progress:
-        progress(3, 10)
-        progress(7, 10)
-    assert isinstance(console.file, StringIO)
-    assert all(text in console.file.getvalue() for text in ("7/10", "left"))
+    shown = StringIO()
+    with ProgressDisplay(Console(file=shown, force_terminal=True, width=120)) as progress:
+        for done in (3, 7):
+            progress(done, 10)
+    assert all(text in shown.getvalue() for text in ("7/10", "left"))
 
 
 def test_without_a_terminal_lines_go_to_the_log(caplog, monkeypatch):

@@ -9,6 +9,12 @@ from dopepp.data.negatives import FrameMix, PhotoFrames
 from dopepp.geometry.camera import camera_matrix
 from dopepp.virtual.backgrounds import PhotoBackgrounds
 
+
+def write_noise(path):
+    rng = np.random.default_rng(int(path.stem))
+    assert cv2.imwrite(str(path), rng.integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8))
+
+
 K = camera_matrix(100.0, 100.0, 31.5, 23.5)
 SIZE = 64, 48
 
@@ -16,10 +22,8 @@ SIZE = 64, 48
 @pytest.fixture
 def folder(tmp_path):
     """Images of the camera's size, as PNG."""
-    rng = np.random.default_rng(0)
     for number in range(4):
-        noise = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8)
-        assert cv2.imwrite(str(tmp_path / f"{number}.png"), noise)
+        write_noise(tmp_path / f"{number}.png")
     return tmp_path
 
 
@@ -60,19 +64,17 @@ def test_a_larger_image_is_cropped_at_its_centre(tmp_path):
 
 
 def test_damaged_images_are_replaced_up_to_a_limit(tmp_path):
-    rng = np.random.default_rng(0)
+    def keys():
+        source = PhotoFrames(PhotoBackgrounds(tmp_path), K, SIZE)
+        return {source.sample(index).key for index in range(120)}
+
     for number in range(120):
-        noise = rng.integers(0, 256, (12, 16, 3), np.uint8)
-        assert cv2.imwrite(str(tmp_path / f"{number:03}.png"), noise)
+        write_noise(tmp_path / f"{number:03}.png")
     (tmp_path / "050.png").write_bytes(b"no image")
-    source = PhotoFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
-    keys = [source.sample(index).key for index in range(120)]
-    assert "050.png/0" not in keys
-    assert len(set(keys)) == 119
+    assert len(keys() - {"050.png/0"}) == len(keys()) == 119
     (tmp_path / "051.png").write_bytes(b"no image")
-    source = PhotoFrames(PhotoBackgrounds(tmp_path), K, (16, 12))
     with pytest.raises(UserError, match="2 damaged of 120"):
-        [source.sample(index) for index in range(120)]
+        keys()
 
 
 def test_the_index_selects_the_source(folder):

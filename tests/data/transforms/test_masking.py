@@ -13,7 +13,7 @@ from dopepp.data.transforms.masking import RandomMask
 from dopepp.data.transforms.shading_protocol import TOLERANCE, shade
 from dopepp.parts.mesh.read import ycb_part
 
-SIZE = (72, 96)
+SIZE, UNKNOWN = (72, 96), np.full((9, 2), np.nan)
 
 
 class Stripes:
@@ -38,9 +38,7 @@ def sample_of(*masks: np.ndarray, contrast: bool = True, seed: int = 0) -> Sampl
     image = rng.integers(0, 190 if contrast else 1, (*SIZE, 3), np.uint8)
     for mask in masks:
         image[mask] = (255, 0, 255)  # a colour that no background has
-    instances = [
-        Instance("box", np.eye(4), np.full((9, 2), np.nan), 0.8, mask.copy()) for mask in masks
-    ]
+    instances = [Instance("box", np.eye(4), UNKNOWN, 0.8, mask.copy()) for mask in masks]
     return Sample(image, np.eye(3), instances)
 
 
@@ -201,9 +199,7 @@ def addressed(*masks: np.ndarray) -> Sample:
     image = np.stack([rows, columns, np.zeros_like(rows)], axis=2).astype(np.uint8)
     for mask in masks:
         image[mask, 2] = OBJECT_BLUE
-    instances = [
-        Instance("box", np.eye(4), np.full((9, 2), np.nan), 0.7, mask.copy()) for mask in masks
-    ]
+    instances = [Instance("box", np.eye(4), UNKNOWN, 0.7, mask.copy()) for mask in masks]
     return Sample(image, np.eye(3), instances, np.ones(SIZE, np.float32))
 
 

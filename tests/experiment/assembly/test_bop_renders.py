@@ -5,6 +5,8 @@ import math
 import os
 import re
 import shutil
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,9 +27,10 @@ from dopepp.experiment.assembly.build_sources import (
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.geometry.camera import project_keypoints
 from dopepp.models.checkpoint import Checkpoint
-from dopepp.parts.part import Mesh, make_part
+from dopepp.parts.part import make_part
 from dopepp.virtual import Factory
 from dopepp.virtual.presets import preset_of
+from tests.data.makers import mesh_of, write_set
 
 SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
          "placement": {"nearest": 0.42, "farthest": 0.58}, "targets_per_image": [2, 2]}  # fmt: skip
@@ -36,20 +39,14 @@ SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     """Two coloured boxes and four images with depth, no training images, no masks."""
-    folder = tmp_path_factory.mktemp("bop") / "set"
     parts = []
-    for name, size in (("red", 0.08), ("blue", 0.09)):
-        box = trimesh.creation.box((size, 0.7 * size, 0.5 * size))
-        shades = np.full((8, 3), (200, 30, 30) if name == "red" else (20, 40, 190), np.uint8)
-        mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32), colours=shades)
-        parts.append(make_part(name, mesh))
+    for name, size, colour in (("red", 0.08, (200, 30, 30)), ("blue", 0.09, (20, 40, 190))):
+        box = mesh_of(trimesh.creation.box((size, 0.7 * size, 0.5 * size)))
+        parts.append(make_part(name, replace(box, colours=np.full((8, 3), colour, np.uint8))))
     source = RenderedSource(Factory(parts, preset_of("upright", SCENE), 3), 4, "test")
-    writer = BopWriter(folder, parts, split="test")
-    writer.prepare()
-    for index in range(4):
-        writer.write(index, source.sample(index))
-    writer.finalize(0, range(4))
-    return folder
+    samples = [source.sample(index) for index in range(4)]
+    folder = tmp_path_factory.mktemp("bop") / "set"
+    return write_set(partial(BopWriter, split="test"), folder, parts, samples)
 
 
 @pytest.fixture
@@ -117,9 +114,8 @@ def test_a_listed_negative_is_read_again_only_after_a_change(config, tmp_path):
     trimesh.creation.box((20.0, 30.0, 50.0)).export(path)
     os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
     second = build_negatives(given.data, parts)[0]
-    assert (first.diameter, second.diameter) == pytest.approx(
-        (math.hypot(0.02, 0.03, 0.04), math.hypot(0.02, 0.03, 0.05))
-    )
+    expected = (math.hypot(0.02, 0.03, 0.04), math.hypot(0.02, 0.03, 0.05))
+    assert (first.diameter, second.diameter) == pytest.approx(expected)
 
 
 def test_validation_renders_of_a_checkpoint_do_not_need_the_data_set(config, tmp_path):

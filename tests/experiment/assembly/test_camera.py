@@ -122,11 +122,14 @@ def test_on_a_table(my_part):
         ("[0.4]", (), "working_distance=[0.4]"),
         ("[0.4,0.7]", ("virtual.camera=null",), "working_distance without camera"),
         ("[0.4,0.7]", ("virtual.camera=/nowhere.yaml",), "camera file /nowhere.yaml"),
-        ("[0.4,0.7]", ("virtual.camera_scale=1.0", "data.input_size=[128,128]"),
-         "data.input_size=[128, 128] for parts 253 pixels across"),
+        (
+            "[0.4,0.7]",
+            ("virtual.camera_scale=1.0", "data.input_size=[128,128]"),
+            "data.input_size=[128, 128] for parts 253 pixels across",
+        ),
         ("[0.4,0.7]", ("virtual.camera_scale=0.1",), "working_distance to 0.7 m, where"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_is_one_line(distance, overrides, got, my_part):
     with pytest.raises(UserError) as error:
         my_part(*overrides, distance=distance)
@@ -141,21 +144,18 @@ def test_a_camera_file_without_image_size_is_rejected(my_part, camera):
 
 
 def test_without_a_camera_the_config_is_unchanged(parsed):
-    config = parsed("experiment=quickstart")
-    assert fit_to_camera(config, []) is config
-    config = parsed("experiment=my_part")
-    assert fit_to_camera(config, []) is config
-    with pytest.raises(
-        UserError, match=r"neither data\.input_size nor a camera.*add the camera's file"
-    ):
+    for experiment in ("quickstart", "my_part"):
+        config = parsed(f"experiment={experiment}")
+        assert fit_to_camera(config, []) is config
+    message = r"neither data\.input_size nor a camera.*add the camera's file"
+    with pytest.raises(UserError, match=message):
         build_datamodule(config.data, build_parts(config.data), 0)
 
 
 def test_a_camera_can_be_given_as_numbers(parsed):
     lens = "{width: 640, height: 480, fx: 600, fy: 600, cx: 320, cy: 240}"
-    config = parsed(
-        "experiment=my_part", f"virtual.camera={lens}", "virtual.working_distance=[0.3,0.4]"
-    )
+    distance = "virtual.working_distance=[0.3,0.4]"
+    config = parsed("experiment=my_part", f"virtual.camera={lens}", distance)
     np.testing.assert_array_equal(config.data.virtual.view.K[0], [600, 0, 320])
     with pytest.raises(UserError, match=r"virtual\.camera\.width"):
         parsed("experiment=my_part", f"virtual.camera={lens.replace('640', '6')}")

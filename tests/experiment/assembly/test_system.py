@@ -29,9 +29,7 @@ from dopepp.experiment.config.run_config import TrainerConfig
         ("mps", "AuthenticAMD", "avx512_bf16", True, "32-true"),
     ],
 )
-def test_bf16_is_selected_only_on_fast_hardware(
-    accelerator, vendor, flags, gpu_is_fast, expected, monkeypatch
-):
+def test_bf16_needs_fast_hardware(accelerator, vendor, flags, gpu_is_fast, expected, monkeypatch):
     facts = {("vendor_id",): vendor, ("flags", "Features"): flags}
     monkeypatch.setattr(built, "cpu_fact", lambda *names: facts[names])
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
@@ -44,10 +42,10 @@ def test_the_estimated_duration_grows_with_the_steps_and_the_network_is_unchange
     parts = build_parts(config.data)
     module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
     before = {name: value.clone() for name, value in system.network.state_dict().items()}
-    trainer = replace(config.trainer, max_epochs=1000, max_steps=-1)
-    long = estimate_training_s(system.network, module, trainer, "32-true")
-    trainer = replace(trainer, max_steps=2)
-    short = estimate_training_s(system.network, module, trainer, "32-true")
+    long, short = (
+        estimate_training_s(system.network, module, replace(config.trainer, **limits), "32-true")
+        for limits in ({"max_epochs": 1000, "max_steps": -1}, {"max_epochs": 1000, "max_steps": 2})
+    )
     assert 0 < short < long
     assert system.network.training
     for name, value in system.network.state_dict().items():
@@ -60,28 +58,21 @@ def alone(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
 
 
-@pytest.mark.parametrize(
-    ("options", "count"),
-    [
-        ({}, 1),
-        ({"devices": 1}, 1),
-        ({"devices": "1"}, 1),
-        ({"devices": [3]}, 1),
-        ({"devices": "3,"}, 1),
-        ({"devices": 1, "strategy": "ddp"}, 1),  # the strategy does not change the number
-        ({"devices": 2}, 2),
-        ({"devices": "2"}, 2),
-        ({"devices": [0, 1]}, 2),
-        ({"devices": "0,1"}, 2),
-        ({"devices": "auto", "accelerator": "cpu"}, 1),
-        ({"devices": "auto", "accelerator": "auto"}, 4),
-        ({"devices": -1, "accelerator": "gpu"}, 4),
-        ({"devices": "-1", "accelerator": "gpu"}, 4),
-        ({"devices": 1, "num_nodes": 2}, 2),
-        ({"devices": 2, "num_nodes": 3}, 6),
-    ],
-)
-def test_number_of_processes(options, count, monkeypatch):
+@pytest.mark.parametrize(("count", "options"), [
+    *((1, options) for options in (
+        {}, {"devices": 1}, {"devices": "1"}, {"devices": [3]}, {"devices": "3,"},
+        {"devices": 1, "strategy": "ddp"},  # the strategy does not change the number
+        {"devices": "auto", "accelerator": "cpu"},
+    )),
+    *((2, {"devices": devices}) for devices in (2, "2", [0, 1], "0,1")),
+    *((4, options) for options in (
+        {"devices": "auto", "accelerator": "auto"}, {"devices": -1, "accelerator": "gpu"},
+        {"devices": "-1", "accelerator": "gpu"},
+    )),
+    (2, {"devices": 1, "num_nodes": 2}),
+    (6, {"devices": 2, "num_nodes": 3}),
+], ids=str)  # fmt: skip
+def test_number_of_processes(count, options, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     assert TrainerConfig(max_epochs=1, **options).num_processes == count

@@ -130,9 +130,7 @@ def test_seen_on_selects_preset_and_rotations(seen_on, preset, turning, parsed):
     ],
 )
 @pytest.mark.parametrize("seen_on", ["front", "bin"])
-def test_materials_changes_the_surfaces_and_shows_panels_to_metals(
-    seen_on, materials, changes, parsed
-):
+def test_materials_change_surfaces_and_metals_see_panels(seen_on, materials, changes, parsed):
     options = ("experiment=my_part", f"seen_on={seen_on}")
     mixture = parsed(*options).data.preset
     chosen = parsed(*options, f"materials={materials}").data.preset

@@ -159,14 +159,10 @@ def test_numbers_with_equal_text_share_a_bin(measured, monkeypatch):
 def test_methods_share_bins_and_score_their_own_objects(measured):
     metrics, truths, _ = measured
     perfect = fed([part("a")], {"a": np.zeros(30)}, {"a": truths["a"]})
-    both = {"dope": perfect, "dopepp": metrics}
-    bins, values = break_down(both, "size", 3, RATES)
+    bins, values = break_down({"dope": perfect, "dopepp": metrics}, "size", 3, RATES)
+    dope, dopepp = ([v for v in values if v.method == name] for name in ("dope", "dopepp"))
     alone = break_down({"dopepp": metrics}, "size", 3, RATES)
-    assert (bins, str([value for value in values if value.method == "dopepp"])) == (
-        alone[0],
-        str(alone[1]),
-    )
-    dope = [value for value in values if value.method == "dope"]
+    assert (bins, str(dopepp)) == (alone[0], str(alone[1]))
     assert sum(value.value for value in dope if value.measure == "num_instances") == 28
     assert {item.text for item in dope if item.measure == "add_01d"} <= {"n/a", "100.0"}
 
@@ -179,11 +175,10 @@ def test_without_instances_there_is_a_warning(tmp_path, caplog):
 
 
 def test_the_reported_rate_depends_on_the_data():
-    data: Any = SimpleNamespace(format="ycb_video", root=Path("data"))
-    parts = [part("a")]
-    assert [column.field for column in reported_rates(data, parts)] == ["pass_10cm", "add_01d"]
-    data.root = None
-    assert [rate.field for rate in reported_rates(data, parts)] == ["pass_5cm", "add_01d"]
+    for root, rate in ((Path("data"), "pass_10cm"), (None, "pass_5cm")):
+        data: Any = SimpleNamespace(format="ycb_video", root=root)
+        columns = reported_rates(data, [part("a")])
+        assert [column.field for column in columns] == [rate, "add_01d"]
 
 
 def test_symmetric_parts_have_a_symmetric_rate(tmp_path):

@@ -31,13 +31,14 @@ from dopepp.experiment.results.differences import (
 from dopepp.experiment.results.folder import CONFIG_FILE, METRICS_FILE, write_config, write_json
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN
+from tests.experiment.conftest import report_of, write_run
 
 GOOD, BAD = [0.005] * 30 + [np.inf] * 2, [0.004] * 10 + [0.02] * 20 + [np.inf] * 2
 BEST = [0.001] * 32
 
 
 @pytest.fixture
-def entry(report_of):
+def entry():
     """Return a method of trainings with the given errors."""
 
     def make(name, *errors, seeds=None, **options):
@@ -96,26 +97,24 @@ def test_a_measure_missing_for_one_seed_is_not_available(entry):
 # Network and refined
 
 
-def test_refined_poses_follow_their_network(entry, report_of):
-    methods = [
-        Entry("dope", [report_of("dope", BAD, refined=GOOD)], [0]),
-        Entry("dopepp", [report_of("dopepp", BAD, refined=BEST)], [0]),
-    ]
-    rows = full_table(comparison_frame(with_refined(methods)))
+def test_refined_poses_follow_their_network(entry):
+    def changes(*methods):
+        rows = full_table(comparison_frame(with_refined(list(methods))))
+        return [(row["method"], row["Δ ADD-0.1d %"]) for row in rows if row["method"] in names]
+
+    dope = Entry("dope", [report_of("dope", BAD, refined=GOOD)], [0])
+    dopepp = Entry("dopepp", [report_of("dopepp", BAD, refined=BEST)], [0])
+    names = ("dope", "dope + region", "dopepp", "dopepp + region")
     # Refined poses are compared with dope's refined poses, and these with dope's network.
-    assert [(row["method"], row["Δ ADD-0.1d %"]) for row in rows[:4]] == [
-        ("dope", ""), ("dope + region", "+62.5"), ("dopepp", "+0.0"), ("dopepp + region", "+6.2"),
-    ]  # fmt: skip
+    assert changes(dope, dopepp) == list(zip(names, ("", "+62.5", "+0.0", "+6.2"), strict=True))
     # Without a refined baseline the network is the baseline.
-    rows = full_table(comparison_frame(with_refined([entry("dope", BAD), methods[1]])))
-    changes = {row["method"]: row.get("Δ ADD-0.1d %") for row in rows}
-    assert changes["dopepp + region"] == "+68.8"
+    assert dict(changes(entry("dope", BAD), dopepp))["dopepp + region"] == "+68.8"
     # A method that was refined in one seed of two has no refined row.
     both = Entry("x", [report_of("x", BAD, refined=GOOD), report_of("x", BAD)], [0, 1])
     assert [item.name for item in with_refined([both])] == ["x"]
 
 
-def test_networks_of_single_parts_are_joined_with_a_mean(report_of):
+def test_networks_of_single_parts_are_joined_with_a_mean():
     bolt = report_of("x", {"bolt": BAD}, refined=GOOD)
     nut = report_of("x", {"nut": BAD}, refined=BEST)
     joined = Report.joined([nut, bolt])
@@ -129,10 +128,8 @@ def test_networks_of_single_parts_are_joined_with_a_mean(report_of):
 # Run folders
 
 
-@pytest.mark.parametrize(("camera_scale", "count"), [(None, 1), (0.5, 2)])
-def test_an_automatic_camera_scale_does_not_change_the_recipe(
-    camera_scale, count, tmp_path, report_of, write_run
-):
+@pytest.mark.parametrize(("camera_scale", "count", "objects"), [(None, 1, 3), (0.5, 2, 1)])
+def test_an_automatic_scale_keeps_the_recipe(camera_scale, count, objects, tmp_path):
     for part, scale in (("bolt", 0.5), ("nut", 0.9)):
         config = {"data": {"objects": [part]}, "virtual": {"camera_scale": scale}}
         result = report_of("x", {part: GOOD})
@@ -140,11 +137,10 @@ def test_an_automatic_camera_scale_does_not_change_the_recipe(
         given = {"virtual": {"camera_scale": camera_scale}}
         (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(given))
     entries = group(find_runs([tmp_path / "bolt", tmp_path / "nut"]))
-    assert len(entries) == count
-    assert len(entries[0].objects) == (3 if count == 1 else 1)
+    assert (len(entries), len(entries[0].objects)) == (count, objects)
 
 
-def test_runs_that_differ_in_the_seed_are_one_method(tmp_path, report_of, write_run):
+def test_runs_that_differ_in_the_seed_are_one_method(tmp_path):
     for number, (model, seed) in enumerate(product(("dope", "dopepp"), (1, 2))):
         overrides, place = [f"model={model}", f"seed={seed}"], {"output_dir": f"somewhere{seed}"}
         write_run(tmp_path / str(number), overrides, report_of(model, GOOD), **place)
@@ -155,7 +151,7 @@ def test_runs_that_differ_in_the_seed_are_one_method(tmp_path, report_of, write_
     assert entries[2].failure == "out of memory"
 
 
-def test_runs_with_other_differences_are_separate_methods(tmp_path, report_of, write_run):
+def test_runs_with_other_differences_are_separate_methods(tmp_path):
     write_run(tmp_path / "0", ["seed=1"], report_of("dopepp", GOOD))
     write_run(tmp_path / "1", ["seed=2", "lr=3"], report_of("dopepp", GOOD), lr=3)
     write_run(tmp_path / "2", ["seed=3"], report_of("dopepp", GOOD, test_set="others"))
@@ -165,7 +161,7 @@ def test_runs_with_other_differences_are_separate_methods(tmp_path, report_of, w
     assert names == unlike
 
 
-def test_methods_have_unique_names_of_differing_overrides(tmp_path, write_run):
+def test_methods_have_unique_names_of_differing_overrides(tmp_path):
     common = ["data=virtual", "seed=1", "output_dir=x", "hydra.verbose=true"]
     write_run(tmp_path / "0", [*common, "model=dope", "+optimizer=adam"])
     write_run(tmp_path / "1", [*common, "model=dopepp", "optimizer=sgd"])
@@ -178,9 +174,7 @@ def test_methods_have_unique_names_of_differing_overrides(tmp_path, write_run):
     assert len(compact_table(comparison_frame(entries))) == 2
 
 
-def test_evaluations_are_grouped_by_the_training_of_their_checkpoint(
-    tmp_path, report_of, write_run
-):
+def test_evaluations_are_grouped_by_the_training_of_a_checkpoint(tmp_path):
     for seed in (1, 2):
         overrides = ["lr=2", f"seed={seed}"]
         run = write_run(tmp_path / f"run{seed}", overrides, report_of("dopepp", BAD), lr=2)
@@ -211,7 +205,7 @@ def test_evaluations_are_grouped_by_the_training_of_their_checkpoint(
         ("checkpoints/last.ckpt", "", "no metrics.json; continue with resume="),
     ],
 )
-def test_damaged_or_unfinished_runs_state_the_reason(file, content, reason, tmp_path, write_run):
+def test_damaged_or_unfinished_runs_state_the_reason(file, content, reason, tmp_path):
     run = write_run(tmp_path / "0")
     assert read_run(run).failure == "unfinished: no metrics.json"
     (run / file).parent.mkdir(exist_ok=True)
@@ -222,9 +216,7 @@ def test_damaged_or_unfinished_runs_state_the_reason(file, content, reason, tmp_
     assert "\n" not in entry.failure
 
 
-def test_repeated_folders_count_once_and_folders_without_runs_are_rejected(
-    tmp_path, report_of, write_run
-):
+def test_folders_count_once_and_folders_without_runs_are_rejected(tmp_path):
     for path in (tmp_path, tmp_path / "missing"):
         with pytest.raises(UserError, match="holds no run"):
             find_runs([path])
@@ -236,18 +228,14 @@ def test_truncated_logs_are_read(tmp_path):
     path = tmp_path / "metrics.csv"
     assert read_log_column(path, "train/loss") == {}
     path.write_text("step,train/loss\n0,1.5\n1,\n2,nan\nx,1\n3,0.5\n4")
-    assert (read_log_column(path, "train/loss"), read_log_column(path, "val/loss")) == (
-        {0: 1.5, 3: 0.5},
-        {},
-    )
+    columns = [read_log_column(path, name) for name in ("train/loss", "val/loss")]
+    assert columns == [{0: 1.5, 3: 0.5}, {}]
 
 
 # The whole
 
 
-def test_unfinished_runs_have_curves_and_broken_checkpoints_are_reported(
-    tmp_path, report_of, write_run
-):
+def test_unfinished_runs_have_curves_and_bad_checkpoints_are_named(tmp_path):
     write_run(tmp_path / "0", ["model=dope"], report_of("dope", BAD))
     unfinished = write_run(tmp_path / "1", ["model=dopepp"])
     for folder in (tmp_path / "0", unfinished):
@@ -266,7 +254,7 @@ def test_unfinished_runs_have_curves_and_broken_checkpoints_are_reported(
     assert cv2.imread(str(out / "compare.png")).shape[2] == 3
 
 
-def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch, report_of, write_run):
+def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch):
     run = write_run(tmp_path / "run", [], report_of("dopepp", GOOD))
     monkeypatch.chdir(tmp_path)
     first, second = compare_paths([run]), compare_paths([run])

@@ -1,7 +1,6 @@
 """Detections on images without the part: numbers counted by hand, and cameras."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -32,10 +31,13 @@ def folder(tmp_path):
     """Nine images whose grey level is 20 times their number."""
     (tmp_path / "photos").mkdir()
     for number in range(9):
-        picture = np.full((48, 64, 3), 20 * number, np.uint8)
-        assert cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), picture)
+        write_image(tmp_path / "photos" / f"{number}.png", np.full((48, 64, 3), 20 * number))
     (tmp_path / "camera.yaml").write_text(CAMERA)
     return tmp_path
+
+
+def write_image(path, pixels):
+    assert cv2.imwrite(str(path), pixels.astype(np.uint8))
 
 
 class Estimator:
@@ -54,36 +56,33 @@ class Estimator:
 
 
 def test_detections_are_counted_from_the_threshold_on(folder, tiny):
-    camera = folder / "camera.yaml"
-    frames = frames_without_parts(folder / "photos", camera, tiny().data, [])
-    estimators: Any = {"dopepp": Estimator()}
-    alarms, tiles = count_false_alarms(estimators, frames)
+    frames = frames_without_parts(folder / "photos", folder / "camera.yaml", tiny().data, [])
+    alarms, tiles = count_false_alarms({"dopepp": Estimator()}, frames)
     # The better candidates of images 4 to 8 and the weaker of image 8 reach 0.39.
     assert alarms["dopepp"].per_picture == pytest.approx(6 / 9)
     loudest = {f"{number}.png": number / 10 for number in range(8, 8 - NUM_LOUDEST, -1)}
     assert alarms["dopepp"].loudest == pytest.approx(loudest)
-    assert list(alarms["dopepp"].loudest) == list(loudest)
-    assert [tile.caption for tile in tiles] == list(loudest)
+    assert [tile.caption for tile in tiles] == list(alarms["dopepp"].loudest) == list(loudest)
 
 
 def test_images_have_the_named_camera_or_the_camera_of_the_data(folder, tiny):
     data = tiny().data
+
+    def samples(camera, parts=()):
+        source = frames_without_parts(folder / "photos", camera, data, parts)
+        return {sample.key: sample for sample in map(source.sample, range(len(source)))}
+
     grid = np.zeros((48, 64, 3), np.uint8)
     grid[::8], grid[:, ::8] = 255, 255
-    assert cv2.imwrite(str(folder / "photos" / "0.png"), grid)
-    named = frames_without_parts(folder / "photos", folder / "camera.yaml", data, [])
-    samples = [named.sample(index) for index in range(len(named))]
-    (sample,) = [sample for sample in samples if sample.key == "0.png"]
+    write_image(folder / "photos" / "0.png", grid)
+    sample = samples(folder / "camera.yaml")["0.png"]
     lens = np.array([-0.3, 0, 0, 0, 0])
     np.testing.assert_array_equal(sample.image, cv2.undistort(grid, sample.K, lens))
     assert (sample.K[0, 0], sample.size, sample.instances) == (60, (64, 48), [])
-    own = frames_without_parts(folder / "photos", None, data, build_parts(data)).sample(0)
-    assert own.size[0] / own.K[0, 0] >= data.preset.width / data.preset.K[0, 0]
     (folder / "K.txt").write_text("60 0 31.5\n0 60 23.5\n0 0 1\n")
-    assert frames_without_parts(folder / "photos", folder / "K.txt", data, []).sample(0).size == (
-        64,
-        48,
-    )
+    assert samples(folder / "K.txt")["0.png"].size == (64, 48)
+    own = next(iter(samples(None, build_parts(data)).values()))
+    assert own.size[0] / own.K[0, 0] >= data.preset.width / data.preset.K[0, 0]
     with pytest.raises(UserError, match="no photo"):
         frames_without_parts(folder / "empty", None, data, [])
 

@@ -3,6 +3,7 @@
 ``WRITE_GOLDEN=1 pytest tests/experiment/results/test_golden.py`` updates the texts.
 """
 
+import logging
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,6 +18,8 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
+from dopepp.core.errors import UserError
+from dopepp.experiment import program
 from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.breakdown import record_breakdown
 from dopepp.experiment.results.compare import compare_paths, write_comparison
@@ -29,9 +32,10 @@ from dopepp.experiment.results.pages import release
 from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import COLUMNS, PoseRow, mean_row
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint import Checkpoint, read, write_atomic
 from dopepp.models.network import build_network
 from dopepp.parts import load_part
+from tests.experiment.conftest import report_of, write_run
 
 GOLDEN = Path(__file__).parent / "golden"
 EXPERIMENTS = Path(__file__).parents[3] / "conf" / "experiment"
@@ -39,6 +43,14 @@ EXPERIMENTS = Path(__file__).parents[3] / "conf" / "experiment"
 GOOD = [0.005] * 30 + [np.inf] * 2
 BAD = [0.004] * 10 + [0.02] * 20 + [np.inf] * 2
 BEST = [0.001] * 32
+CONFIG: Any = SimpleNamespace(
+    model=SimpleNamespace(name="dopepp"), data=SimpleNamespace(name="hybrid"),
+    trainer=SimpleNamespace(max_epochs=3), keep_checkpoints=True,
+)  # fmt: skip
+
+
+def table_of(experiment: str) -> dict[str, Any]:
+    return yaml.safe_load((EXPERIMENTS / f"{experiment}.yaml").read_text())["table"]
 
 
 @pytest.fixture
@@ -69,7 +81,7 @@ def end(folder: str, table: dict[str, Any] | None = None) -> None:
 # Comparisons
 
 
-def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden, report_of, write_run):
+def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden):
     rng = np.random.default_rng(0)
     for number, (model, seed) in enumerate(product(("dopepp", "dope"), (1, 2))):
         errors = rng.gamma(1, 0.01 if model == "dope" else 0.004, 60)
@@ -86,7 +98,7 @@ def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden, report_of, wr
     compare_golden("sweep", "sweep/compare.md", "sweep/compare.csv", "sweep/README.md")
 
 
-def test_a_single_training_per_method(compare_golden, report_of):
+def test_a_single_training_per_method(compare_golden):
     entries = [
         Entry("dope", [report_of("dope", BAD)], [None]),
         Entry("dopepp", [report_of("dopepp", GOOD)], [None]),
@@ -98,7 +110,7 @@ def test_a_single_training_per_method(compare_golden, report_of):
     compare_golden("comparison", "compare.md", "compare.csv")
 
 
-def test_symmetric_objects_and_unknown_images(compare_golden, report_of):
+def test_symmetric_objects_and_unknown_images(compare_golden):
     entries = [
         Entry("dope", [report_of("dope", BAD, test_set="", num_symmetries=2)] * 2, [1, 2]),
         Entry("dopepp", [report_of("dopepp", GOOD, num_symmetries=2)], [1]),
@@ -107,7 +119,7 @@ def test_symmetric_objects_and_unknown_images(compare_golden, report_of):
     compare_golden("comparison_symmetric", "compare.md", "compare.csv")
 
 
-def test_unequal_seeds(compare_golden, report_of):
+def test_unequal_seeds(compare_golden):
     entries = [
         Entry("dope", [report_of("dope", BAD), report_of("dope", GOOD)], [1, 2]),
         Entry("dopepp", [report_of("dopepp", GOOD), report_of("dopepp", BEST)], [2, 3]),
@@ -117,7 +129,7 @@ def test_unequal_seeds(compare_golden, report_of):
     compare_golden("comparison_seeds", "compare.md", "compare.csv")
 
 
-def test_nothing_but_failures(compare_golden, write_run):
+def test_nothing_but_failures(compare_golden):
     write_run(Path("runs", "0"), ["model=dope"], "no memory")
     write_run(Path("runs", "1"), ["model=dopepp"], "no disk")
     compare_paths([Path("runs")], Path("out"))
@@ -127,35 +139,31 @@ def test_nothing_but_failures(compare_golden, write_run):
 # The paper's tables
 
 
-def runs_of_table(table: dict[str, Any]) -> list[tuple[list[str], list[str]]]:
-    """Return the overrides and parts of a run for each label and object of a table."""
-    parts = sorted({part for row in table["paper"].values() for part in row} - {MEAN}) or ["part"]
-    return [([label], parts) for label in table["labels"]]
-
-
 @pytest.mark.parametrize(
     "experiment",
-    ["table1_real_hybrid", "table2_mask", "table5_attention", "table6_dope_vs_dopepp",
-     "table7_ycbv"],
-)  # fmt: skip
-def test_paper_tables_of_poses(experiment, compare_golden, report_of, write_run):
-    table = yaml.safe_load((EXPERIMENTS / f"{experiment}.yaml").read_text())["table"]
-    rng, number = np.random.default_rng(1), 0
-    for label, parts in runs_of_table(table)[:4]:
-        for seed in (1, 2):
-            errors = {part: rng.gamma(1, 0.01, 40) for part in parts[:3]}
-            result = report_of("x", errors, refined=rng.gamma(1, 0.004, 40) if seed else None)
-            overrides = [*label, f"seed={seed}"]
-            write_run(Path("sweep", str(number)), overrides, result, label=label, recipe="paper")
-            number += 1
-    write_run(Path("sweep", str(number)), ["model=other"], "no memory")
+    [
+        "table1_real_hybrid",
+        "table2_mask",
+        "table5_attention",
+        "table6_dope_vs_dopepp",
+        "table7_ycbv",
+    ],
+)
+def test_paper_tables_of_poses(experiment, compare_golden):
+    table, rng = table_of(experiment), np.random.default_rng(1)
+    parts = sorted({part for row in table["paper"].values() for part in row} - {MEAN}) or ["part"]
+    for number, (label, seed) in enumerate(product(list(table["labels"])[:4], (1, 2))):
+        errors = {part: rng.gamma(1, 0.01, 40) for part in parts[:3]}
+        result = report_of("x", errors, refined=rng.gamma(1, 0.004, 40))
+        folder, overrides = Path("sweep", str(number)), [label, f"seed={seed}"]
+        write_run(folder, overrides, result, label=[label], recipe="paper")
+    write_run(Path("sweep", str(number + 1)), ["model=other"], "no memory")
     end("sweep", table)
-    compare_golden(
-        experiment, "sweep/table.md", "sweep/table.csv", terminal=experiment.endswith("pp")
-    )
+    files = ("sweep/table.md", "sweep/table.csv")
+    compare_golden(experiment, *files, terminal=experiment.endswith("pp"))
 
 
-def test_a_table_of_one_network_per_part(compare_golden, report_of, write_run):
+def test_a_table_of_one_network_per_part(compare_golden):
     errors = {
         "none": {"bolt": [0.06, 0.06], "nut": [0.004] * 8 + [0.06] * 2},
         "random": {"bolt": [0.004, 0.06], "nut": [0.004] * 9 + [0.06]},
@@ -182,10 +190,9 @@ def test_a_table_of_one_network_per_part(compare_golden, report_of, write_run):
     compare_golden("table_of_parts", "sweep/table.md", "sweep/table.csv", terminal=False)
 
 
-def test_a_table_without_results(compare_golden, write_run):
-    table = yaml.safe_load((EXPERIMENTS / "table6_dope_vs_dopepp.yaml").read_text())["table"]
+def test_a_table_without_results(compare_golden):
     write_run(Path("sweep", "0"), ["model=dope"], "no memory")
-    end("sweep", table)
+    end("sweep", table_of("table6_dope_vs_dopepp"))
     compare_golden("table_empty", "sweep/table.md", "sweep/table.csv")
 
 
@@ -200,22 +207,18 @@ def shading_csv(rates: dict[str, Sequence[float]], part: str = "part") -> str:
     return "\n".join(lines) + "\n"
 
 
-def test_paper_table_of_shading(compare_golden, report_of, write_run):
-    number = 0
-    for mask, seed, part in product(("none", "random"), (1, 2, 3), ("servoholder", "pivconnector")):
-        folder = Path("sweep", str(number))
-        config = {"data": {"parts": [part]}, "mask": mask}
+def test_paper_table_of_shading(compare_golden):
+    runs = product(("none", "random"), (1, 2, 3), ("servoholder", "pivconnector"))
+    for number, (mask, seed, part) in enumerate(runs):
         overrides = [f"data/masking={mask}", f"data.parts=[{part}]", f"seed={seed}"]
         result = report_of("x", {part: BAD}, refined=GOOD, test_set=part)
-        write_run(folder, overrides, result, **config)
-        base = 0.9 if mask == "random" else 0.7
-        rates = [base - 0.4 * share * seed for share in SHARES]
+        config = {"data": {"parts": [part]}, "mask": mask}
+        folder = write_run(Path("sweep", str(number)), overrides, result, **config)
+        rates = [{"random": 0.9, "none": 0.7}[mask] - 0.4 * share * seed for share in SHARES]
         rows = {"x": rates, "x + region": [1.0, 0.9, 0.8, 0.7, 0.6], "stray": [0.1] * 5}
         (folder / "shading.csv").write_text(shading_csv(rows, part))
-        number += 1
-    write_run(Path("sweep", str(number)), ["model=other"], report_of("other", BAD))
-    table = yaml.safe_load((EXPERIMENTS / "table3_shading.yaml").read_text())["table"]
-    end("sweep", table)
+    write_run(Path("sweep", str(number + 1)), ["model=other"], report_of("other", BAD))
+    end("sweep", table_of("table3_shading"))
     compare_golden("table3_shading", "sweep/table.md", "sweep/table.csv")
 
 
@@ -228,8 +231,8 @@ COSTS = {
 
 
 @pytest.mark.parametrize("experiment", ["table4_parameters", "table8_time"])
-def test_paper_tables_of_cost(experiment, compare_golden, report_of, write_run):
-    table = yaml.safe_load((EXPERIMENTS / f"{experiment}.yaml").read_text())["table"]
+def test_paper_tables_of_cost(experiment, compare_golden):
+    table = table_of(experiment)
     for number, label in enumerate(table["labels"]):
         folder = write_run(Path("sweep", str(number)), [label])
         write_json(folder / COST_FILE, {**COSTS, "parameters": 1000 ** (number + 1)})
@@ -300,7 +303,7 @@ def full_row(name: str, method: str, num_symmetries: int) -> PoseRow:
 
 
 @pytest.fixture
-def report(report_of):
+def report():
     report = report_of("dopepp", {"bolt": BAD, "nut": GOOD, "absent": []})
     for name, num_symmetries in (("bolt", 1), ("nut", 4), (MEAN, 4)):
         report.rows[name] = full_row(name, "dopepp", num_symmetries)
@@ -317,12 +320,7 @@ def test_a_report_in_the_terminal(report, all_measures, compare_golden):
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_readme_of_a_run(keep, report, compare_golden):
-    config: Any = SimpleNamespace(
-        model=SimpleNamespace(name="dopepp"),
-        data=SimpleNamespace(name="hybrid"),
-        trainer=SimpleNamespace(max_epochs=3),
-        keep_checkpoints=keep,
-    )
+    config: Any = SimpleNamespace(**vars(CONFIG) | {"keep_checkpoints": keep})
     folder = Path("a run")
     command = {"command": ["train.py", "data.parts=[a,b]"]}
     again = {"command": ["train.py", "resume=RUN"], "earlier": [command, {"other": 1}]}
@@ -341,6 +339,29 @@ def test_readme_of_a_run(keep, report, compare_golden):
     texts.append((folder / "README.md").read_text())
     Path("pages").write_text("-----\n".join(texts))
     compare_golden(f"readme_{'kept' if keep else 'trial'}", "pages", terminal=False)
+
+
+@pytest.fixture
+def released(tiny_spec, tmp_path):
+    """Release a checkpoint with the report of its run."""
+
+    def make(name="bracket", checkpoint="best.ckpt", metrics="metrics.json", refined=None):
+        torch.manual_seed(0)
+        config = {
+            "virtual": {"preset": "wide"},
+            "masking": {"probability": 0.3},
+            "cache_dir": "/x/y",
+        }
+        content = Checkpoint(
+            tiny_spec, build_network(tiny_spec).state_dict(), [load_part("pivconnector")],
+            (64, 48), 8, 1.0, data={"name": "dopepp", "config": config},
+        )  # fmt: skip
+        write_atomic(content.to_file(), tmp_path / "best.ckpt")
+        result = report_of("dopepp", {"pivconnector": BAD}, refined=refined)
+        write_json(tmp_path / "metrics.json", result.to_record())
+        return release(tmp_path / checkpoint, tmp_path / metrics, name, tmp_path / "out")
+
+    return make
 
 
 def test_readmes_of_jobs_and_multiruns(report, compare_golden):
@@ -371,15 +392,53 @@ def test_the_table_of_a_cost(compare_golden):
 
 
 @pytest.mark.parametrize("is_refined", [True, False])
-def test_the_card_of_a_release(is_refined, report_of, tiny_spec, compare_golden):
-    config = {"virtual": {"preset": "wide"}, "masking": {"probability": 0.3}, "cache_dir": "/x/y"}
-    torch.manual_seed(0)
-    checkpoint = Checkpoint(
-        tiny_spec, build_network(tiny_spec).state_dict(), [load_part("pivconnector")],
-        (64, 48), 8, 1.0, data={"name": "dopepp", "config": config},
-    )  # fmt: skip
-    write_atomic(checkpoint.to_file(), Path("best.ckpt"))
-    result = report_of("dopepp", {"pivconnector": BAD}, refined=GOOD if is_refined else None)
-    write_json(Path("metrics.json"), result.to_record())
-    release(Path("best.ckpt"), Path("metrics.json"), "bracket", Path("out"))
+def test_the_card_of_a_release(is_refined, released, compare_golden):
+    weights, _ = released(refined=GOOD if is_refined else None)
+    assert read(weights).data["config"]["cache_dir"] is None
     compare_golden(f"card_{'refined' if is_refined else 'network'}", "out/bracket.md")
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"name": "../x"}, r"name '\.\./x'; allowed: letters"),
+    ({"metrics": "other.json"}, r"other\.json"),
+    ({"checkpoint": "other.ckpt"}, r"other\.ckpt"),
+    ({}, "of weights in half precision; allowed: at most 100"),
+], ids=str)  # fmt: skip
+def test_rejected_releases(change, message, released, tmp_path, monkeypatch):
+    torch.save({"a": 1}, tmp_path / "other.ckpt")
+    if not change:
+        monkeypatch.setattr(pages, "MAX_BYTES", 100)
+    with pytest.raises(UserError, match=message):
+        released(**change)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Return a run folder with a space in its name."""
+    folder = tmp_path / "a run"
+    write_json(folder / VERSIONS_FILE, {"command": ["train.py", "data.parts=[a,b]"]})
+    return folder
+
+
+def test_the_readme_is_not_written_before_the_run_begins(run, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/dopepp", "train", "seed=1"])
+    page, path = pages.RunReadme(CONFIG, run), run / pages.README_FILE
+    page.end(pages.FAILED, "too early")
+    assert not path.exists()
+    page.begin()
+    assert path.read_text().startswith("# dopepp on hybrid: running\n\nSince ")
+    assert f"\ndopepp train resume='{run}'  # continue" in path.read_text()
+
+
+def test_paths_are_relative_to_the_working_directory(run, monkeypatch):
+    assert program.relative_path(run) == str(run)
+    monkeypatch.chdir(run.parent)
+    assert program.relative_path(run / "x") == "a run/x"
+
+
+def test_a_failing_readme_does_not_end_the_run(run, caplog):
+    (run / pages.README_FILE).mkdir()
+    with caplog.at_level(logging.WARNING):
+        pages.RunReadme(CONFIG, run).begin()
+    assert f"cannot write {run / pages.README_FILE}" in caplog.text

@@ -15,6 +15,7 @@ from dopepp.experiment.results.compare import compare_paths
 from dopepp.experiment.results.paper import PaperTable
 from dopepp.experiment.run.train import do_job
 from dopepp.experiment.sweep.multirun import CompareJobs
+from tests.experiment.conftest import report_of, write_run
 
 FOLDER = Path(__file__).parents[3] / "conf" / "experiment"
 EXPERIMENTS = sorted(
@@ -31,7 +32,7 @@ def end(folder, table):
     return read_csv(folder / "table.csv")
 
 
-def test_a_multirun_writes_its_table_before_it_fails(tmp_path, report_of, write_run):
+def test_a_multirun_writes_its_table_before_it_fails(tmp_path):
     end(tmp_path, {"title": "6"})  # of no jobs: nothing to say
     write_run(tmp_path / "0", ["model=dopepp"], report_of("dopepp", ERRORS))
     write_run(tmp_path / "10", ["model=dopepp"])
@@ -42,14 +43,14 @@ def test_a_multirun_writes_its_table_before_it_fails(tmp_path, report_of, write_
     assert rows[1]["method"].endswith("unfinished: no metrics.json")
 
 
-def test_parts_with_other_seeds_are_not_joined(tmp_path, report_of, write_run):
+def test_parts_with_other_seeds_are_not_joined(tmp_path):
     for number, part in enumerate(("bolt", "nut")):
         result = report_of("x", {part: ERRORS}, test_set=part)
         write_run(tmp_path / str(number), [f"seed={number}"], result, data={"parts": [part]})
     assert "mean" not in [row["object"] for row in end(tmp_path, {"title": "Table 2"})]
 
 
-def test_shading_table_has_refined_rows_and_no_other_methods(tmp_path, report_of, write_run):
+def test_shading_table_has_refined_rows_and_no_other_methods(tmp_path):
     for number, model in enumerate(("dope", "dopepp")):
         result = report_of("x", ERRORS, refined=ERRORS)
         folder = write_run(tmp_path / str(number), [f"model={model}"], result, model=model)
@@ -69,7 +70,7 @@ def test_shading_table_has_refined_rows_and_no_other_methods(tmp_path, report_of
     assert read_rgb(tmp_path / "table_shading.png").std() > 0
 
 
-def test_costs(composed, tmp_path, write_run):
+def test_costs(composed, tmp_path):
     small = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=3", "cost.batch_size=2")
     for number, name in enumerate(("dope", "dopepp")):
         folder = write_run(tmp_path / str(number), [f"model={name}"])
@@ -123,7 +124,7 @@ def test_impossible_tables(table, message):
         PaperTable.of(table)
 
 
-def test_finished_runs_in_another_tables_layout(tmp_path, report_of, write_run):
+def test_finished_runs_in_another_tables_layout(tmp_path):
     write_run(tmp_path / "sweep" / "0", ["model=dope"], report_of("dope", ERRORS))
     layout = FOLDER / "table6_dope_vs_dopepp.yaml"
     out = compare_paths([tmp_path / "sweep"], tmp_path / "out", table=layout)
@@ -132,7 +133,7 @@ def test_finished_runs_in_another_tables_layout(tmp_path, report_of, write_run):
 
 
 @pytest.mark.parametrize("text", ["model: dope\n", "table: Table 6\n", "- table\n"])
-def test_an_experiment_without_a_table_is_rejected_early(text, tmp_path, report_of, write_run):
+def test_an_experiment_without_a_table_is_rejected_early(text, tmp_path):
     write_run(tmp_path / "0", ["model=dope"], report_of("dope", ERRORS))
     path = tmp_path / "experiment.yaml"
     path.write_text(text)

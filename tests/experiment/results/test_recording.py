@@ -1,6 +1,5 @@
 """Poses of another method are read, measured and written by an evaluation."""
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_csv
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.bop.bop_results import BopResult, read_results, write_results
@@ -18,10 +18,11 @@ from dopepp.data.formats.bop.bop_writer import BopWriter
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.experiment.results.measurement import image_id, object_numbers
-from dopepp.experiment.run.evaluate import run_evaluation
+from dopepp.experiment.results.report import Cost
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
+from tests.data.makers import write_set
 
 NUM_IMAGES = 4
 SPLITS = "data.image_sets={train: none, val: none, test: train_pbr}"
@@ -30,15 +31,23 @@ SPLITS = "data.image_sets={train: none, val: none, test: train_pbr}"
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     """A BOP data set of two parts on every image."""
-    folder = tmp_path_factory.mktemp("two-parts")
     parts = [servoholder(), pivconnector()]
     factory = Factory(parts, PRESETS["bin"].resized(160, 120), seed=11)
-    writer = BopWriter(folder, parts)
-    writer.prepare()
-    for index in range(NUM_IMAGES):
-        writer.write(index, rendered_sample(factory.render(0, index), "virtual", str(index)))
-    writer.finalize(0, range(NUM_IMAGES))
-    return folder
+    samples = [rendered_sample(factory.render(0, n), "virtual", str(n)) for n in range(NUM_IMAGES)]
+    return write_set(BopWriter, tmp_path_factory.mktemp("two-parts"), parts, samples)
+
+
+@pytest.fixture
+def results_of(root, evaluate):
+    """Evaluate the poses of a file, which is written first, on the data set."""
+
+    def run(path, *others, poses=None, folder="run"):
+        if poses is not None:
+            write_results(path, poses)
+        options = ("data=bop", f"data.root={root}", SPLITS, "num_pictures=1", f"results={path}")
+        return evaluate(*options, *others, folder=folder)
+
+    return run
 
 
 def results(root: Path, offset: float = 0.0) -> list[BopResult]:
@@ -55,50 +64,37 @@ def results(root: Path, offset: float = 0.0) -> list[BopResult]:
     return poses
 
 
-def options(root: Path, *others: str) -> list[str]:
-    return ["data=bop", f"data.root={root}", SPLITS, "num_pictures=1", *others]
-
-
-def test_poses_of_a_file_are_measured_and_written_again(root, composed, tmp_path, capsys):
-    path = tmp_path / "posecnn_two-test.csv"
-    write_results(path, results(root, 0.002))
-    config = composed(*options(root, f"results={path}", "bop_csv=true"), config="evaluate")
-    (report,) = run_evaluation(config, tmp_path / "run")
+def test_poses_of_a_file_are_measured_and_written_again(root, results_of, tmp_path, capsys):
+    poses = results(root, 0.002)
+    (report,) = results_of(tmp_path / "posecnn_two-test.csv", "bop_csv=true", poses=poses)
     assert report.name == report.mean.method == "posecnn"
-    assert report.cost.ms_per_frame == 250
-    assert (report.cost.parameters, report.cost.gmacs) == (None, None)
+    assert report.cost == Cost(None, None, 250)
     for name in ("servoholder", "pivconnector"):
         counted = [error for error in report.errors[name] if np.isfinite(error)]
         assert counted == pytest.approx([0.002] * len(counted), rel=1e-6)
-        assert report.rows[name].ar_mssd == 1
-        assert report.rows[name].ar_mspd is not None
-        assert report.rows[name].average_precision == 1
+        row = report.rows[name]
+        assert (row.ar_mssd, row.average_precision) == (1, 1)
+        assert row.ar_mspd is not None
     shown = capsys.readouterr().out
     assert "AR_MSPD %" in shown
     assert "ADD-S-0.1d %" not in shown
 
     written = tmp_path / "run" / f"posecnn_{root.name.replace('-', '')}-train-pbr.csv"
-    for back, detection in zip(
-        read_results(written, {1, 2}), read_results(path, {1, 2}), strict=False
-    ):
-        np.testing.assert_allclose(back.T_cam_obj[:3, 3], detection.T_cam_obj[:3, 3], atol=1e-6)
-    again = composed(*options(root, f"results={written}", "method=again"), config="evaluate")
-    (second,) = run_evaluation(again, tmp_path / "second")
+    for read, pose in zip(read_results(written, {1, 2}), poses, strict=True):
+        np.testing.assert_allclose(read.T_cam_obj[:3, 3], pose.T_cam_obj[:3, 3], atol=1e-6)
+    (second,) = results_of(written, "method=again", folder="second")
     assert {name: vars(row) | {"method": ""} for name, row in second.rows.items()} == {
         name: vars(row) | {"method": ""} for name, row in report.rows.items()
     }
     record = json.loads((tmp_path / "second" / "metrics.json").read_text())
     assert record["objects"]["mean"]["ar_mspd"] == report.mean.ar_mspd
-    with (tmp_path / "second" / "auc.csv").open() as stream:
-        assert next(csv.reader(stream))[1:] == ["servoholder", "pivconnector"]
+    columns = read_csv(tmp_path / "second" / "auc.csv")[0]
+    assert list(columns)[1:] == ["servoholder", "pivconnector"]
 
 
-def test_metrics_json_describes_the_network_not_the_file(root, composed, tmp_path):
-    path = tmp_path / "other_two-test.csv"
-    write_results(path, results(root))
+def test_metrics_json_describes_the_network_not_the_file(root, results_of, tmp_path):
     network = ("ckpt_path=pretrained/pivconnector", "refine=region")
-    config = composed(*options(root, f"results={path}", *network), config="evaluate")
-    reports = run_evaluation(config, tmp_path / "run")
+    reports = results_of(tmp_path / "other_two-test.csv", *network, poses=results(root))
     assert [report.name for report in reports] == ["dopepp_fast", "dopepp_fast + region", "other"]
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert written == reports[0].to_record()
@@ -106,38 +102,20 @@ def test_metrics_json_describes_the_network_not_the_file(root, composed, tmp_pat
     assert "| other " not in (tmp_path / "run" / "README.md").read_text()
 
 
-def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog):
+def test_poses_beside_the_test_set_are_left_out(root, results_of, tmp_path, caplog):
     poses = results(root)
     elsewhere = BopResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
-    path = tmp_path / "results.csv"
-    write_results(path, [*poses, elsewhere])
-    arguments = options(root, f"results={path}", "data.objects=[pivconnector]", "num_pictures=0")
-    (report,) = run_evaluation(composed(*arguments, config="evaluate"), tmp_path / "run")
+    chosen = ("data.objects=[pivconnector]", "num_pictures=0")
+    (report,) = results_of(tmp_path / "results.csv", *chosen, poses=[*poses, elsewhere])
     assert list(report.rows) == ["pivconnector", "mean"]
     others = sum(pose.obj_id == 1 for pose in poses)
     assert f"ignoring 1 poses on images outside the test set and {others} poses" in caplog.text
 
 
-def test_a_results_file_of_other_data_is_rejected(root, composed, tmp_path):
-    path = tmp_path / "results.csv"
-    write_results(path, [replace(results(root)[0], scene_id=3)])
-    config = composed(*options(root, f"results={path}"), config="evaluate")
+def test_a_results_file_of_other_data_is_rejected(root, results_of, tmp_path):
+    poses = [replace(results(root)[0], scene_id=3)]
     with pytest.raises(UserError, match=r"results\.csv.* outside the test set, e.g. scene 3"):
-        run_evaluation(config, tmp_path / "run")
-
-
-def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
-    with pytest.raises(
-        UserError, match=r"got nothing to evaluate; allowed: one or more of ckpt_path=…"
-    ):
-        run_evaluation(composed(config="evaluate"), tmp_path)
-    with pytest.raises(UserError, match=r"x\.csv, which contains no data config; .*data=…"):
-        run_evaluation(composed("results=x.csv", config="evaluate"), tmp_path)
-    with pytest.raises(UserError, match=r"x\.csv, which contains no options of the renders"):
-        run_evaluation(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
-    with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave out refine"):
-        run_evaluation(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)
-    assert not list(tmp_path.iterdir())
+        results_of(tmp_path / "results.csv", poses=poses)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Exports are checked before they are written."""
 
-from __future__ import annotations
-
 import errno
 import os
 from dataclasses import replace

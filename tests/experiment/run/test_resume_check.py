@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from dopepp.core.errors import UserError
-from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.results.folder import CONFIG_FILE, write_config
 from dopepp.experiment.run.resume import (
     check_resume,
@@ -21,44 +21,32 @@ from dopepp.experiment.run.resume import (
     trusted_overrides,
 )
 from dopepp.models.checkpoint import Checkpoint
+from tests.data.makers import MadeSource, pose_at
 
 
-class ConstantImages:
-    """A source of one image."""
+def one_image(level: int = 100, shift: float = 0.0, **identity: object) -> MadeSource:
+    """Return a source of one image of a grey level, with a part that may be shifted."""
 
-    name = "images"
+    def make(index: int, epoch: int) -> Sample:
+        image = np.full((48, 64, 3), level, np.uint8)
+        part = Instance("part", pose_at(0, 0, 0.5 + shift), np.zeros((9, 2)))
+        return Sample(image, np.eye(3), [part], None, "x", "0")
 
-    def __init__(self, level: int = 100, shift: float = 0.0, **identity: object) -> None:
-        self.level, self.shift, self.identity = level, shift, identity
-
-    def __len__(self) -> int:
-        return 1
-
-    def sample(self, index: int, epoch: int = 0) -> Sample:
-        image = np.full((48, 64, 3), self.level, np.uint8)
-        T = np.eye(4)
-        T[2, 3] = 0.5 + self.shift
-        return Sample(image, np.eye(3), [Instance("part", T, np.zeros((9, 2)))], None, "x", "0")
-
-    def describe(self) -> list[SourceInfo]:
-        return [SourceInfo(self.name, 1, self.identity)]
-
-    def contains(self, label: str) -> bool:
-        return True
+    return MadeSource(make, 1, "images", identity)
 
 
 def test_descriptions_of_images_reveal_differences():
-    first = describe_images(ConstantImages(files="ab" * 32, parts={"a": "1"}))
+    first = describe_images(one_image(files="ab" * 32, parts={"a": "1"}))
     # Through a file and back, and with another machine's rounding, it is the same.
     again = yaml.safe_load(yaml.safe_dump(first))
-    rounded = describe_images(ConstantImages(101, 1e-7, files="ab" * 32, parts={"a": "1"}))
+    rounded = describe_images(one_image(101, 1e-7, files="ab" * 32, parts={"a": "1"}))
     assert (differing_images(first, again), differing_images(first, rounded)) == ([], [])
     for other, expected in (
-        (ConstantImages(files="cd" * 32, parts={"a": "1"}), "0 images.files: abab"),
-        (ConstantImages(files="ab" * 32, parts={"a": "2"}), "0 images.parts.a: 1 → 2"),
-        (ConstantImages(files="ab" * 32), "0 images.parts.a: 1 → None"),
-        (ConstantImages(100, 0.01, files="ab" * 32, parts={"a": "1"}), "labels of the first image"),
-        (ConstantImages(110, 0.0, files="ab" * 32, parts={"a": "1"}), "pixels of the first image"),
+        (one_image(files="cd" * 32, parts={"a": "1"}), "0 images.files: abab"),
+        (one_image(files="ab" * 32, parts={"a": "2"}), "0 images.parts.a: 1 → 2"),
+        (one_image(files="ab" * 32), "0 images.parts.a: 1 → None"),
+        (one_image(100, 0.01, files="ab" * 32, parts={"a": "1"}), "labels of the first image"),
+        (one_image(110, 0.0, files="ab" * 32, parts={"a": "1"}), "pixels of the first image"),
     ):
         (line,) = differing_images(first, describe_images(other))
         assert line.startswith(expected)
@@ -66,16 +54,14 @@ def test_descriptions_of_images_reveal_differences():
 
 
 def test_a_new_preset_field_with_equal_images_is_no_difference():
-    first, new = (
-        describe_images(ConstantImages(preset=text)) for text in ("Preset()", "Preset(a=1)")
-    )
+    first, new = (describe_images(one_image(preset=text)) for text in ("Preset()", "Preset(a=1)"))
     assert differing_images(first, new) == []
-    (line,) = differing_images(first, describe_images(ConstantImages(110, preset="Preset(a=1)")))
+    (line,) = differing_images(first, describe_images(one_image(110, preset="Preset(a=1)")))
     assert line == "pixels of the first image"
 
 
 def test_a_part_that_is_called_preset_is_compared():
-    first, other = (describe_images(ConstantImages(parts={"preset": mesh})) for mesh in "12")
+    first, other = (describe_images(one_image(parts={"preset": mesh})) for mesh in "12")
     assert differing_images(first, other) == ["0 images.parts.preset: 1 → 2"]
 
 
@@ -85,9 +71,9 @@ def resumed(tiny, tmp_path):
     (tmp_path / "run").mkdir()
     started = tiny()
     write_config(tmp_path / "run", started.plain)
-    images = {split: describe_images(ConstantImages()) for split in ("train", "val", "test")}
+    images = {split: describe_images(one_image()) for split in ("train", "val", "test")}
 
-    def go_on(*overrides: str, spec: str = "a", **splits: ConstantImages) -> list[str]:
+    def go_on(*overrides: str, spec: str = "a", **splits: MadeSource) -> list[str]:
         saved = Checkpoint({"net": "a"}, {}, [], (64, 64), 8, 1.0, data={"images": images})
         present = {**images, **{name: describe_images(first) for name, first in splits.items()}}
         payload = {"spec": {"net": spec}, "data": {"images": copy.deepcopy(present)}}
@@ -121,7 +107,7 @@ def test_options_without_effect_on_learning_may_change(resumed):
 def test_unchanged_runs_have_no_differences(resumed):
     assert resumed() == []
     assert resumed("output_dir=/elsewhere", "resume=x", "resume_anyway=true") == []
-    assert resumed(test=ConstantImages(50)) == []  # test images do not affect learning
+    assert resumed(test=one_image(50)) == []  # test images do not affect learning
 
 
 LEARNT_FROM = {
@@ -156,7 +142,7 @@ def test_learning_options_change_only_with_resume_anyway(resumed):
 
 @pytest.mark.parametrize("split", ["train", "val"])
 def test_changed_images_with_equal_options_are_rejected(split, resumed):
-    changed: dict[str, Any] = {split: ConstantImages(50)}
+    changed: dict[str, Any] = {split: one_image(50)}
     with pytest.raises(UserError, match=rf"{split} images: as trained on → changed \(pixels of"):
         resumed(**changed)
     assert len(resumed("resume_anyway=true", **changed)) == 1

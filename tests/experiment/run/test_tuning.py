@@ -19,6 +19,7 @@ from dopepp.experiment.run.tuning import (
     MIN_REFINED_FACTOR,
     MIN_REFINED_SCORE,
     ScoredDetections,
+    TuningCache,
     WrongFocalLengths,
     choose,
     fit_factors,
@@ -36,16 +37,50 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts import load_part
 from dopepp.recovery.detection import FEATURES, REFINED_FEATURES, Detection, score
+from tests.data.makers import MadeSource
+
+
+def source_of(*poses: np.ndarray | None, visible_fraction: float = 1.0) -> MadeSource:
+    """Return images of the part, with their number in every pixel; None shows no part."""
+
+    def make(index: int, epoch: int) -> Sample:
+        image, T = np.full((128, 128, 3), index, np.uint8), poses[index]
+        if T is None:
+            return Sample(image, K)
+        keypoints = project_keypoints(PART.cuboid, T, K)
+        return Sample(image, K, [Instance(PART.name, T, keypoints, visible_fraction)])
+
+    return MadeSource(make, len(poses))
+
+
+def noise() -> MadeSource:
+    """Return a source of three images of noise."""
+
+    def make(index: int, epoch: int) -> Sample:
+        image = np.random.default_rng([index, epoch]).integers(0, 256, (64, 64, 3), np.uint8)
+        instance = Instance("servoholder", np.eye(4), np.zeros((9, 2)))
+        return Sample(image, K, [replace(instance, mask=np.zeros((64, 64), bool))])
+
+    return MadeSource(make, 3, "noise")
+
 
 K = camera_matrix(300, 300, 64, 64)
 NOTHING = ScoredDetections(
-    np.zeros((0, len(FEATURES))),
-    np.zeros(0),
-    np.zeros(0, bool),
-    np.zeros(0, int),
-    ["photos"] * 100,
-    0,
-)
+    np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int),
+    ["photos"] * 100, 0,
+)  # fmt: skip
+
+
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+PART = load_part("pivconnector")
+POSE = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
+VERIFIES = SimpleNamespace(verifies=True)
+
+
+def best_scores(empty: ScoredDetections, options: dict[str, float]) -> np.ndarray:
+    """Return the best score of each image without objects, with the chosen weights."""
+    weights = np.array([options[f"score_{name}"] for name in FEATURES])
+    return empty.best_scores(score(empty.features, weights))
 
 
 def scored(seed: int, count: int, right: bool = True) -> ScoredDetections:
@@ -65,18 +100,19 @@ def test_scores_are_calibrated_and_low_on_images_without_objects():
     scores = np.concatenate([score(item.features, weights) for item in (shown, empty)])
     correct = np.concatenate([shown.correct, empty.correct])
     assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
-    loud = empty.best_scores(score(empty.features, weights)) >= options["min_score"]
+    loud = best_scores(empty, options) >= options["min_score"]
     assert loud.mean() <= 4 * FalsePositiveTarget.false_positive_rate
     assert options["min_score"] < 1
+
+
+TWO, OCCLUDED = source_of(POSE, None), source_of(POSE, None, visible_fraction=0.05)
 
 
 def test_the_threshold_meets_the_false_positive_rate():
     shown, empty = scored(4, 500), scored(5, 250, right=False)
     for rate in (0.0, 0.005, 0.1):
         options = choose(shown, empty, rate)
-        weights = np.array([options[f"score_{name}"] for name in FEATURES])
-        loud = empty.best_scores(score(empty.features, weights)) >= options["min_score"]
-        assert loud.sum() == int(rate * 250)
+        assert (best_scores(empty, options) >= options["min_score"]).sum() == int(rate * 250)
     assert choose(shown, empty, 1.0)["min_score"] == 0.0
     assert choose(scored(6, 300), NOTHING)["min_score"] < 1e-300  # silence needs no threshold
 
@@ -89,37 +125,14 @@ def test_tuning_needs_correct_and_incorrect_detections(correct, what):
         choose(NOTHING, NOTHING)
 
 
-class Images:
-    """Two images: one of a part at a pose, one without parts."""
-
-    name = "two"
-
-    def __init__(self, T: np.ndarray, visible_fraction: float = 1.0) -> None:
-        keypoints = project_keypoints(PART.cuboid, T, K)
-        instance = Instance(PART.name, T, keypoints, visible_fraction)
-        blank = np.zeros((128, 128, 3), np.uint8)
-        self.samples = [Sample(blank, K, [instance]), Sample(blank, K)]
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def sample(self, index: int, epoch: int) -> Sample:
-        return self.samples[index]
-
-
-PART = load_part("pivconnector")
-POSE = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
-VERIFIES = SimpleNamespace(verifies=True)
-
-
-def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
+def found(T: np.ndarray, certainty: float, shift: float = 0.0, **changes: Any) -> Detection:
     """Return a detection at a pose, shifted by a share of the part's diameter."""
     moved = T.copy()
     moved[0, 3] += shift * PART.diameter
-    keypoints = project_keypoints(PART.cuboid, moved, K)
-    return Detection(
-        PART.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
-    )
+    points = project_keypoints(PART.cuboid, moved, K)
+    scores, covariance = (certainty, certainty), 1e-6 * np.eye(6)
+    made = Detection(PART.name, *scores, moved, points, points, 1.0, covariance)
+    return replace(made, **changes)
 
 
 def estimator(*detections: Detection, refiner: object = None) -> Any:
@@ -128,16 +141,16 @@ def estimator(*detections: Detection, refiner: object = None) -> Any:
 
 def test_correct_detections_match_once_within_a_tenth_of_the_diameter():
     detections = [found(POSE, 0.9, 0.05), found(POSE, 0.8, 0.05), found(POSE, 0.7, 0.2)]
-    result = score_images(estimator(*detections), [PART], Images(POSE))
+    result = score_images(estimator(*detections), [PART], TWO)
     # A duplicate is wrong, and so are all detections on the image without the part.
     assert result.correct.tolist() == [True, False, False, False, False, False]
     assert (result.num_images, result.num_instances) == (2, 1)
     far = estimator(found(POSE, 0.9, 0.2))
-    assert not score_images(far, [PART], Images(POSE)).correct.any()
+    assert not score_images(far, [PART], TWO).correct.any()
 
 
 def test_detections_of_occluded_instances_do_not_count():
-    result = score_images(estimator(found(POSE, 0.9), found(POSE, 0.8)), [PART], Images(POSE, 0.05))
+    result = score_images(estimator(found(POSE, 0.9), found(POSE, 0.8)), [PART], OCCLUDED)
     # The best detection matches the occluded instance and does not count. The duplicate is wrong,
     # and so are both detections on the image without the part.
     assert result.correct.tolist() == [False, False, False]
@@ -146,49 +159,29 @@ def test_detections_of_occluded_instances_do_not_count():
 
 def test_matched_poses_include_equivalent_poses():
     near, stray = found(POSE, 0.9, 0.05), found(POSE, 0.8, 3.0)
-    ((pose, true),) = matched_poses(estimator(near, stray), [PART], Images(POSE))
+    ((pose, true),) = matched_poses(estimator(near, stray), [PART], TWO)
     assert pose is near
     assert np.array_equal(true, POSE[None])
-    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
-    symmetric = replace(PART, symmetries_discrete=flip[None])
-    ((_, alike),) = matched_poses(estimator(near), [symmetric], Images(POSE))
-    assert np.array_equal(alike, [POSE, POSE @ flip])
-    assert matched_poses(estimator(near), [PART], Images(POSE, 0.05)) == []
+    symmetric = replace(PART, symmetries_discrete=FLIP[None])
+    ((_, alike),) = matched_poses(estimator(near), [symmetric], TWO)
+    assert np.array_equal(alike, [POSE, POSE @ FLIP])
+    assert matched_poses(estimator(near), [PART], OCCLUDED) == []
 
 
 def test_factors_of_a_biased_and_overconfident_network():
     rng = np.random.default_rng(0)
     deviation = np.array([0.02, 0.02, 0.01, 0.002, 0.002, 0.004])
-    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     pairs = []
     for number in range(2000):
         step = 1.5 * deviation * rng.normal(size=6)
         turn = rotation_vector_to_matrix(step[:3])
         T = make_transform(turn @ POSE[:3, :3], 0.9 * (POSE[:3, 3] + step[3:]))
-        item = replace(found(T, 0.9), covariance=np.diag(deviation**2))
-        equivalents = [POSE, POSE @ flip]
-        pairs.append((item, np.array(equivalents[:: -1 if number % 3 == 0 else 1])))
+        equivalents = np.array([POSE, POSE @ FLIP][:: -1 if number % 3 == 0 else 1])
+        pairs.append((found(T, 0.9, covariance=np.diag(deviation**2)), equivalents))
     factors = fit_factors(pairs)
     assert factors["distance_factor"] == pytest.approx(1 / 0.9, rel=0.01)
     assert factors["covariance_factor"] == pytest.approx(2.25, rel=0.1)
     assert fit_factors([]) == {"distance_factor": 1.0, "covariance_factor": 1.0}
-
-
-class Many:
-    """Images of the part on the optical axis, each with its number in the first pixel."""
-
-    name = "many"
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def sample(self, index: int, epoch: int) -> Sample:
-        image = np.full((128, 128, 3), index, np.uint8)
-        keypoints = project_keypoints(PART.cuboid, POSE, K)
-        return Sample(image, K, [Instance(PART.name, POSE, keypoints, 1.0)])
 
 
 class Refining:
@@ -199,24 +192,27 @@ class Refining:
 
     def candidates(self, image: np.ndarray, K: np.ndarray, **_: object) -> list[Detection]:
         number = int(image[0, 0, 0])
+        if number % 5 == 0:
+            return [found(POSE, 0.9, 0.3, agreement=0.9)]
         deviation = np.array([0.01, 0.01, 0.01, 0.001, 0.001, 0.002])
         step = np.sqrt(self.true) * deviation * np.random.default_rng(number).normal(size=6)
         T = make_transform(rotation_vector_to_matrix(step[:3]), POSE[:3, 3] + step[3:])
-        if number % 5 == 0:
-            return [replace(found(POSE, 0.9, 0.3), agreement=0.9)]
-        detection = replace(found(T, 0.9), covariance=np.diag(deviation**2), agreement=0.9)
-        kept = number % 5 == 1
-        return [replace(detection, agreement=None, covariance=np.eye(6)) if kept else detection]
+        if number % 5 == 1:
+            return [found(T, 0.9, covariance=np.eye(6), agreement=None)]
+        return [found(T, 0.9, covariance=np.diag(deviation**2), agreement=0.9)]
+
+
+def refined_factor(true: float, count: int = 250) -> float:
+    return fit_refined_factor(Refining(true), [PART], source_of(*[POSE] * count))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("true", "fitted"), [(0.8, 0.8), (0.3, MIN_REFINED_FACTOR)])
 def test_the_refined_factor_is_fitted_to_correct_poses(true, fitted):
-    factor = fit_refined_factor(Refining(true), [PART], Many(250))  # type: ignore[arg-type]
-    assert factor == pytest.approx(fitted, rel=0.15)
+    assert refined_factor(true) == pytest.approx(fitted, rel=0.15)
 
 
 def test_the_focal_length_is_wrong_by_up_to_the_scale_error():
-    source = WrongFocalLengths(Many(200))
+    source = WrongFocalLengths(source_of(*[POSE] * 200))
     cameras = [source.sample(index).K for index in range(len(source))]
     errors = np.array([camera[0, 0] / K[0, 0] - 1 for camera in cameras])
     assert np.abs(errors).max() <= SCALE_ERROR
@@ -227,56 +223,47 @@ def test_the_focal_length_is_wrong_by_up_to_the_scale_error():
     assert again[1, 1] / K[1, 1] == pytest.approx(again[0, 0] / K[0, 0])
 
 
-def test_a_wrong_focal_length_keeps_the_pixels_and_distances_of_parts_beside_the_axis():
-    class Beside(Many):
-        def sample(self, index: int, epoch: int = 0) -> Sample:
-            sample = super().sample(index, epoch)
-            poses = [POSE.copy() for _ in range(3)]
-            for T, shift in zip(
-                poses, ((0.2, -0.1, 0.0), (-0.3, 0.1, 0.2), (0, 0, 0)), strict=True
-            ):
-                T[:3, 3] += shift
-            instances = [replace(sample.instances[0], T_cam_obj=T) for T in poses]
-            return replace(sample, instances=instances)
-
-    right, wrong = Beside(4).sample(3), WrongFocalLengths(Beside(4)).sample(3)
+def test_a_wrong_focal_length_keeps_the_pixels_and_distances_of_parts():
+    sample, shifts = source_of(POSE).sample(0), ((0.2, -0.1, 0.0), (-0.3, 0.1, 0.2), (0, 0, 0))
+    poses = [make_transform(POSE[:3, :3], POSE[:3, 3] + shift) for shift in shifts]
+    right = replace(sample, instances=[replace(sample.instances[0], T_cam_obj=T) for T in poses])
+    source: Any = SimpleNamespace(name="beside", sample=lambda index, epoch: right)
+    wrong = WrongFocalLengths(source).sample(3)
     assert wrong.K[0, 0] != right.K[0, 0]
-    assert_array_equal(wrong.instances[0].T_cam_obj, right.instances[0].T_cam_obj)
-    for before, after in zip(right.instances, wrong.instances, strict=True):
-        center, turned = before.T_cam_obj[:3, 3], after.T_cam_obj[:3, 3]
+    assert_array_equal(wrong.instances[0].T_cam_obj, poses[0])
+    for before, instance in zip(poses, wrong.instances, strict=True):
+        after = instance.T_cam_obj
+        center, turned = before[:3, 3], after[:3, 3]
         pixel, seen = right.K @ center / center[2], wrong.K @ turned / turned[2]
         assert_allclose(seen, pixel, atol=1e-4)
         assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(center))
-        rotation = after.T_cam_obj[:3, :3] @ before.T_cam_obj[:3, :3].T
-        assert_allclose(rotation @ center, turned, atol=1e-12)
+        assert_allclose(after[:3, :3] @ before[:3, :3].T @ center, turned, atol=1e-12)
 
 
 def test_few_refined_poses_keep_their_covariances(caplog):
-    few = Refining(true=0.4)
-    assert fit_refined_factor(few, [PART], Many(MIN_REFINED)) == 1.0  # type: ignore[arg-type]
+    assert refined_factor(0.4, MIN_REFINED) == 1.0
     assert f"12 correct poses, fewer than {MIN_REFINED}" in caplog.text
     with pytest.raises(UserError, match="refinement is far too confident"):
-        fit_refined_factor(Refining(true=9.0), [PART], Many(250))  # type: ignore[arg-type]
+        refined_factor(9.0)
 
 
 def test_refined_poses_are_scored_by_their_verification():
-    sure = replace(found(POSE, 0.3), probability=0.9)
-    result = score_images(estimator(sure, refiner=VERIFIES), [PART], Images(POSE))
+    sure = found(POSE, 0.3, probability=0.9)
+    result = score_images(estimator(sure, refiner=VERIFIES), [PART], TWO)
     expected = [1.0, np.log(0.3 / 0.7), np.log(0.9 / 0.1)]
     np.testing.assert_allclose(result.features, [expected, expected])
-    nothing = score_images(estimator(refiner=VERIFIES), [PART], Images(POSE))
+    nothing = score_images(estimator(refiner=VERIFIES), [PART], TWO)
     assert nothing.features.shape == (0, 3)
     unverified = estimator(sure, refiner=SimpleNamespace(verifies=False))
-    assert score_images(unverified, [PART], Images(POSE)).features.shape == (2, len(FEATURES))
+    assert score_images(unverified, [PART], TWO).features.shape == (2, len(FEATURES))
 
 
 def test_lookalikes_do_not_raise_the_threshold():
     shown, empty = scored(8, 500), scored(9, 100, right=False)
     alike = replace(empty, kinds=["look-alikes" if k % 2 else "photos" for k in range(100)])
     options = choose(shown, alike, 0.0)
-    weights = np.array([options[f"score_{name}"] for name in FEATURES])
-    best_scores = empty.best_scores(score(empty.features, weights))
-    assert np.nextafter(best_scores[::2].max(), 1.0) == options["min_score"]
+    photos = best_scores(empty, options)[::2]
+    assert np.nextafter(photos.max(), 1.0) == options["min_score"]
     assert alike.shows_lookalikes().sum() == 50
 
 
@@ -305,19 +292,17 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
 
 
 def test_several_sources_are_scored_together():
-    images = Images(POSE)
-    both = score_images(estimator(found(POSE, 0.9)), [PART], images, Images(POSE))
+    both = score_images(estimator(found(POSE, 0.9)), [PART], TWO, TWO)
     assert (both.num_images, both.num_instances) == (4, 2)
     assert both.image.tolist() == [0, 1, 2, 3]
 
 
 def test_equivalent_poses_of_a_symmetric_part_are_correct():
-    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
-    mirrored = replace(PART, points=np.vstack([PART.points, PART.points @ flip[:3, :3]]))
-    turned = estimator(found(POSE @ flip, 0.9))
-    assert not score_images(turned, [mirrored], Images(POSE)).correct.any()
-    symmetric = replace(mirrored, symmetries_discrete=flip[None])
-    assert score_images(turned, [symmetric], Images(POSE)).correct.tolist() == [True, False]
+    mirrored = replace(PART, points=np.vstack([PART.points, PART.points @ FLIP[:3, :3]]))
+    turned = estimator(found(POSE @ FLIP, 0.9))
+    assert not score_images(turned, [mirrored], TWO).correct.any()
+    symmetric = replace(mirrored, symmetries_discrete=FLIP[None])
+    assert score_images(turned, [symmetric], TWO).correct.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("name", ["best.ckpt", "best.safetensors"])
@@ -328,8 +313,48 @@ def test_the_tuned_checkpoint_is_written_next_to_the_original(tiny_spec, tmp_pat
     chosen = {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
     path = write_tuned(old, tmp_path / name, {**chosen, "refined_min_score": 0.7})
     assert path == tmp_path / "best_tuned.ckpt"
-    tuned = PoseEstimator.load(path)
-    assert (tuned.recovery.max_angle_deg, tuned.recovery.min_score) == (30.0, 0.5)
-    assert tuned.recovery.distance_factor == 0.95
-    assert tuned.recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)
-    assert tuned.recovery.refined_min_score == 0.7
+    recovery = PoseEstimator.load(path).recovery
+    assert (recovery.max_angle_deg, recovery.min_score) == (30.0, 0.5)
+    assert (recovery.distance_factor, recovery.refined_min_score) == (0.95, 0.7)
+    assert recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)
+
+
+def test_items_of_a_source_are_cached_up_to_the_limit():
+    source, other = noise(), noise()
+    cache = TuningCache(max_bytes=2 * 64 * 64 * 4)  # of two images with their masks
+    cached, other_cached = cache.of(source), cache.of(other)
+    assert len(cached) == 3
+    for _ in range(2):
+        for index in range(3):
+            assert (cached.sample(index).image == source.sample(index).image).all()
+    assert [source.requests.count((index, 0)) for index in range(3)] == [3, 3, 4]
+    cached.sample(0, epoch=1)
+    assert (0, 1) in source.requests
+    other_cached.sample(0)
+    assert other.requests == [(0, 0)]  # items of other sources are separate
+
+
+@pytest.mark.parametrize(("most", "length"), [(1, 1), (2, 2), (3, 3), (9, 3)])
+def test_a_source_ends_when_it_has_enough_instances(most, length):
+    source = noise()
+    cached = TuningCache().of(source, most)
+    assert len(cached) == length
+    assert source.requests == [(index, 0) for index in range(length)]
+
+
+def test_a_network_runs_once_per_image(tiny_spec):
+    torch.manual_seed(0)
+    network = build_network(tiny_spec)
+    part = load_part("servoholder")
+    checkpoint = Checkpoint(tiny_spec, network.state_dict(), [part], (64, 64), 8, 1.0, {})
+    estimator = PoseEstimator(network, checkpoint)
+    passes: list[int] = []
+    estimator.network.register_forward_hook(lambda *_: passes.append(1))
+    cached = TuningCache().with_cached_maps(estimator)
+    first, second = (noise().sample(index).image for index in range(2))
+    for image in (first, second, first, first[::-1].copy(), second):
+        for left, same in zip(cached.maps(image), estimator.maps(image), strict=True):
+            torch.testing.assert_close(left, same, rtol=0, atol=0)
+    assert len(passes) == 5 + 3
+    cached.recovery = None  # the original estimator is unchanged
+    assert estimator.recovery is not None

@@ -1,6 +1,7 @@
 import io
 import json
 import pickle
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,12 @@ from dopepp.data.formats import share_slice
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.images import decode_mask, decode_rgb, encode_png
+from tests.data.makers import block
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 R = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 """Rotation, row by row: x_cam = −y_obj, y_cam = x_obj."""
+TARGETS = "test_targets_bop19.json"
 
 
 def truth(number: int, t: tuple[float, float, float] = (5.0, -10.0, 250.0)) -> dict[str, Any]:
@@ -60,10 +63,8 @@ def scene(tmp_path):
     """Two images, with two blocks on the first."""
     made = Scene(tmp_path)
     made.annotate({"3": [truth(9), truth(2)], "11": []}, {"3": [0.25, 0.75], "11": []})
-    image = np.zeros((48, 64, 3), np.uint8)
-    image[..., 0] = 200
     for stem in ("000003", "000011"):
-        made.image(f"rgb/{stem}.png", image)
+        made.image(f"rgb/{stem}.png", np.full((48, 64, 3), (200, 0, 0), np.uint8))
         made.image(f"depth/{stem}.png", np.full((48, 64), 500, np.uint16))
     mask = np.zeros((48, 64), np.uint8)
     mask[10:20, 30:40] = 255
@@ -71,8 +72,14 @@ def scene(tmp_path):
     return made
 
 
-def test_conventions_in_literal_numbers(scene, block):
-    source = BopReader(scene.root, [block(2)], "test")
+@pytest.fixture
+def open_test(scene):
+    """Read the scene as a data set of one part."""
+    return partial(BopReader, scene.root, [block(2)], "test")
+
+
+def test_conventions_in_literal_numbers(open_test):
+    source = open_test()
     assert len(source) == 2
     sample = source.sample(0)
     (instance,) = sample.instances
@@ -81,13 +88,9 @@ def test_conventions_in_literal_numbers(scene, block):
     np.testing.assert_array_equal(sample.K, np.reshape(K, (3, 3)))
     # The centre projects to fx·x/z + cx = 100·5/250 + 31.5 and 101·(−10)/250 + 23.5.
     np.testing.assert_allclose(instance.keypoints[8], [33.5, 19.46], atol=1e-12)
-    projected, _ = cv2.projectPoints(
-        1000 * block(2).cuboid,
-        Rotation.from_matrix(np.reshape(R, (3, 3))).as_rotvec(),
-        np.array([5.0, -10.0, 250.0]),
-        np.reshape(K, (3, 3)),
-        None,
-    )
+    turn = Rotation.from_matrix(np.reshape(R, (3, 3))).as_rotvec()
+    place = np.array([5.0, -10.0, 250.0])
+    projected, _ = cv2.projectPoints(1000 * block(2).cuboid, turn, place, sample.K, None)
     np.testing.assert_allclose(instance.keypoints, projected[:, 0], atol=1e-9)
     assert (instance.visible_fraction, instance.mask.sum()) == (0.75, 100)
     assert instance.mask[10, 30]
@@ -98,17 +101,17 @@ def test_conventions_in_literal_numbers(scene, block):
     assert instance.T_cam_obj.flags.writeable
     empty = source.sample(1)
     assert (empty.instances, empty.key) == ([], "000001/000011")
-    assert source.contains("obj_000002")
-    assert not source.contains("obj_000009")
+    contained = [source.contains(name) for name in ("obj_000002", "obj_000009")]
+    assert contained == [True, False]
     (info,) = source.describe()
     assert info.num_instances == {"obj_000002": 1}
     assert info.identity["left_out"] == {"other_objects": 1, "behind_the_camera": 0}
     copied = pickle.loads(pickle.dumps(source)).sample(0)
     np.testing.assert_array_equal(copied.image, sample.image)
-    assert BopReader(scene.root, [block(2)], "test", read_depth=False).sample(0).depth is None
+    assert open_test(read_depth=False).sample(0).depth is None
 
 
-def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path, block):
+def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path):
     scene = Scene(tmp_path, "val", 7)
     scene.annotate({"0": [truth(1)], "1": [truth(1)]}, None)
     grey = np.tile(np.arange(64, dtype=np.uint8), (48, 1))
@@ -126,7 +129,7 @@ def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path, block):
         assert sample.instances[0].mask is None
 
 
-def test_a_missing_visible_fraction_is_estimated(tmp_path, block):
+def test_a_missing_visible_fraction_is_estimated(tmp_path):
     scene = Scene(tmp_path)
     half_out = truth(1, (-78.75, 0.0, 250.0))  # its centre is on the left border, pixel −½ + ½
     scene.annotate({"0": [truth(1), half_out]}, None)
@@ -142,7 +145,7 @@ def test_a_missing_visible_fraction_is_estimated(tmp_path, block):
     assert "estimated" in str(source.describe()[0].identity["visible_fractions"])
 
 
-def test_scenes_images_targets_and_shares(tmp_path, block):
+def test_scenes_images_targets_and_shares(tmp_path):
     for number in (2, 10):
         scene = Scene(tmp_path, "train_pbr", number)
         scene.annotate({str(i): [truth(1)] for i in (0, 2, 10, 1)}, None)
@@ -158,13 +161,13 @@ def test_scenes_images_targets_and_shares(tmp_path, block):
     assert everything == [f"{s:06d}/{i:06d}" for s in (2, 10) for i in (0, 1, 2, 10)]
     assert keys(part_of=(0, 0.8)) + keys(part_of=(0.8, 0.9)) + keys(part_of=(0.9, 1)) == everything
     targets = [{"scene_id": 10, "im_id": i, "obj_id": 1, "inst_count": 1} for i in (10, 0, 0)]
-    (tmp_path / "test_targets_bop19.json").write_text(json.dumps(targets))
-    assert keys(targets="test_targets_bop19.json") == ["000010/000000", "000010/000010"]
+    (tmp_path / TARGETS).write_text(json.dumps(targets))
+    assert keys(targets=TARGETS) == ["000010/000000", "000010/000010"]
     with pytest.raises(UserError, match=r"no image in the fraction 0 – 0\.01 of 8 images"):
         keys(part_of=(0, 0.01))
-    (tmp_path / "test_targets_bop19.json").write_text('[{"scene_id": "1", "im_id": 3}]')
+    (tmp_path / TARGETS).write_text('[{"scene_id": "1", "im_id": 3}]')
     with pytest.raises(UserError, match=r"bop19\.json\[0\]\.scene_id=.1."):
-        keys(targets="test_targets_bop19.json")
+        keys(targets=TARGETS)
 
 
 @settings(max_examples=60)
@@ -182,12 +185,12 @@ def test_shares_are_disjoint_and_complete(num_items, inner):
         share_slice(num_items, (0.5, 0.5), "x")
 
 
-def test_absent_images_and_objects_behind_the_camera_are_counted(scene, caplog, block):
+def test_absent_images_and_objects_behind_the_camera_are_counted(scene, open_test, caplog):
     caplog.set_level("INFO")
     (scene.folder / "rgb" / "000011.png").unlink()
     scene.json("scene_gt", {"3": [truth(2, (0, 0, -50.0)), truth(2)], "99": [truth(2)]})
     scene.json("scene_gt_info", {"3": [{"visib_fract": 0.0}] * 2, "99": [{"visib_fract": 1}]})
-    source = BopReader(scene.root, [block(2)], "test")
+    source = open_test()
     assert [len(source.sample(i).instances) for i in range(len(source))] == [1]
     assert source.sample(0).instances[0].mask is not None  # number 1 of the list
     assert "1 of 2 listed images are absent" in caplog.text
@@ -202,15 +205,13 @@ def bent(by: float) -> dict[str, Any]:
     return truth(2) | {"cam_R_m2c": (shear @ np.reshape(R, (3, 3))).ravel().tolist()}
 
 
-def test_inexact_rotations_are_replaced_and_logged_once(scene, block, caplog):
+def test_inexact_rotations_are_replaced_and_logged_once(scene, open_test, caplog):
     scene.json("scene_gt", {"3": [bent(5e-3), truth(2)], "11": [bent(9e-3), bent(9e-4)]})
     scene.json("scene_gt_info", {})
-    source = BopReader(scene.root, [block(2)], "test")
+    source = open_test()
     source.sample(0)
-    lines = [line for line in caplog.messages if "orthogonal" in line]
-    assert lines == [
-        "bop/test: 2 rotations are orthogonal to 0.01 only; using the nearest rotations"
-    ]
+    (line,) = [line for line in caplog.messages if "orthogonal" in line]
+    assert line == "bop/test: 2 rotations are orthogonal to 0.01 only; using the nearest rotations"
     got = source.sample(0).instances[0].T_cam_obj[:3, :3]
     np.testing.assert_allclose(got @ got.T, np.eye(3), atol=1e-12)
     stated = np.reshape(bent(5e-3)["cam_R_m2c"], (3, 3))
@@ -219,16 +220,16 @@ def test_inexact_rotations_are_replaced_and_logged_once(scene, block, caplog):
     np.testing.assert_array_equal(almost.ravel(), bent(9e-4)["cam_R_m2c"])  # as it is
     scene.json("scene_gt", {"3": [bent(1.2e-2)]})
     with pytest.raises(UserError, match=r"cam_R_m2c: not a rotation: .*0\.012 \(allowed 1e-02\)"):
-        BopReader(scene.root, [block(2)], "test")
+        open_test()
 
 
-def test_missing_infos_and_models_are_accepted_and_counted(scene, block, caplog):
+def test_missing_infos_and_models_are_accepted_and_counted(scene, open_test, caplog):
     caplog.set_level("INFO")
     scene.json("scene_gt", {"3": [truth(9), truth(2)], "11": [truth(9), truth(2)]})
     scene.json("scene_gt_info", {"3": [{"visib_fract": 0.25}, {"visib_fract": 0.75}]})
     (scene.root / "models").mkdir()
     (scene.root / "models" / "models_info.json").write_text('{"2": {"diameter": 46.0}}')
-    source = BopReader(scene.root, [block(2)], "test")
+    source = open_test()
     assert "ignoring objects without a model: 9 (2)" in caplog.text
     assert "none of the parts" not in caplog.text
     assert "1 objects' visible fractions are estimated" in caplog.text
@@ -236,42 +237,36 @@ def test_missing_infos_and_models_are_accepted_and_counted(scene, block, caplog)
     assert fractions == pytest.approx([0.75, 1.0])
 
 
-def test_a_list_of_targets_marks_the_most_visible_instances(scene, block, caplog):
-    fractions = [0.2, 0.9, 0.05, 0.5]
+def test_a_list_of_targets_marks_the_most_visible_instances(scene, open_test, caplog):
     truths = [truth(2, (x, 0, 250)) for x in (-30.0, -10.0, 10.0, 30.0)]
-    scene.annotate({"3": truths, "11": [truth(2)]}, {"3": fractions, "11": [0.8]})
-    listed = [{"scene_id": 1, "im_id": 3, "obj_id": 2, "inst_count": 2}]
-    (scene.root / "test_targets_bop19.json").write_text(json.dumps(listed))
-    source = BopReader(scene.root, [block(2)], "test", targets="auto")
-    assert len(source) == 1
-    assert [instance.wanted for instance in source.sample(0).instances] == [
-        False,
-        True,
-        False,
-        True,
-    ]
-    listed[0]["inst_count"] = 7
-    (scene.root / "test_targets_bop19.json").write_text(json.dumps(listed))
-    assert "not counted" not in caplog.text
-    BopReader(scene.root, [block(2)], "test", targets="auto")
+    scene.annotate({"3": truths, "11": [truth(2)]}, {"3": [0.2, 0.9, 0.05, 0.5], "11": [0.8]})
+    path = scene.root / TARGETS
+
+    def wanted(count, **options):
+        listed = {"scene_id": 1, "im_id": 3, "obj_id": 2, "inst_count": count}
+        path.write_text(json.dumps([listed]))
+        source = open_test(**options)
+        return len(source), [instance.wanted for instance in source.sample(0).instances]
+
+    assert wanted(2, targets="auto") == (1, [False, True, False, True])
+    assert "no annotation" not in caplog.text
+    wanted(7, targets="auto")
     assert "bop/test: 3 listed instances have no annotation or no model" in caplog.text
-    every = BopReader(scene.root, [block(2)], "test")
-    assert [instance.wanted for instance in every.sample(0).instances] == [None] * 4
-    assert len(every) == 2
-    (scene.root / "test_targets_bop19.json").unlink()
-    assert len(BopReader(scene.root, [block(2)], "test", targets="auto")) == 2
+    assert wanted(7) == (2, [None] * 4)
+    path.unlink()
+    assert len(open_test(targets="auto")) == 2
 
 
-def test_the_view_has_the_first_camera_and_the_range_of_depths(scene, block):
+def test_the_view_has_the_first_camera_and_the_range_of_depths(scene, open_test):
     scene.annotate({"3": [truth(2, (0, 0, 251.0)), truth(9)], "11": [truth(2, (0, 0, 309.0))]}, {})
-    size, camera, distances = BopReader(scene.root, [block(2)], "test").view()
+    size, camera, distances = open_test().view()
     assert (size, distances) == ((64, 48), (0.25, 0.31))
     np.testing.assert_array_equal(camera, np.reshape(K, (3, 3)))
     scene.annotate({"3": [truth(9)], "11": []}, {})
-    assert BopReader(scene.root, [block(2)], "test").view()[2] is None
+    assert open_test().view()[2] is None
 
 
-def test_the_published_linemod_occlusion(shared_data, caplog):
+def test_the_published_linemod_occlusion(shared_data):
     root = shared_data / "lmo_bop"
     if not root.is_dir():
         pytest.skip(f"no {root}")
@@ -280,15 +275,13 @@ def test_the_published_linemod_occlusion(shared_data, caplog):
     assert any("105 rotations are orthogonal" in note for note in report.notes)
     parts = bop_parts(root)
     source = BopReader(root, parts, "test")
-    rotations = np.array(
-        [item.T_cam_obj[:3, :3] for i in range(3) for item in source.sample(i).instances]
-    )
-    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    assert errors.max() <= 1e-3
+    for item in [item for index in range(3) for item in source.sample(index).instances]:
+        rotation = item.T_cam_obj[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3)
     assert all(part.mesh.colours is not None for part in parts)
 
 
-def test_nested_matrices_and_integers_are_accepted(tmp_path, block):
+def test_nested_matrices_and_integers_are_accepted(tmp_path):
     scene = Scene(tmp_path)
     nested = truth(1) | {"cam_R_m2c": np.reshape(R, (3, 3)).tolist(), "cam_t_m2c": [[0], [0], [9]]}
     scene.annotate({"0": [nested]}, {"0": [1]})
@@ -298,10 +291,10 @@ def test_nested_matrices_and_integers_are_accepted(tmp_path, block):
     np.testing.assert_array_equal(instance.T_cam_obj[:3, :3], np.reshape(R, (3, 3)))
 
 
-def test_files_that_contradict_an_image_are_rejected(scene, block):
+def test_files_that_contradict_an_image_are_rejected(scene, open_test):
     def refused(match, **options):
         with pytest.raises(UserError, match=match):
-            BopReader(scene.root, [block(2)], "test", **options).sample(0)
+            open_test(**options).sample(0)
 
     content = (scene.folder / "rgb" / "000003.png").read_bytes()
     (scene.folder / "rgb" / "000003.jpg").write_bytes(content)
@@ -315,33 +308,29 @@ def test_files_that_contradict_an_image_are_rejected(scene, block):
     refused(r"K with .*cx=500.*image 3", read_depth=False)
 
 
-def test_wrong_folders_are_rejected(scene, tmp_path, block):
-    with pytest.raises(
-        UserError, match=r"train_pbr, which is not a folder; allowed: one of \['test"
-    ):
-        BopReader(scene.root, [block(2)], "train_pbr")
+def test_wrong_folders_are_rejected(scene, tmp_path):
+    def refused(match, root=scene.root, split="test"):
+        with pytest.raises(UserError, match=match):
+            BopReader(root, [block(2)], split)
+
+    refused(r"train_pbr, which is not a folder; allowed: one of \['test", split="train_pbr")
     (tmp_path / "empty" / "test").mkdir(parents=True)
-    with pytest.raises(UserError, match="which has no scene"):
-        BopReader(tmp_path / "empty", [block(2)], "test")
+    refused("which has no scene", tmp_path / "empty")
     for path in (scene.folder / "rgb").iterdir():
         path.unlink()
-    with pytest.raises(UserError, match=r"no image under .* \(2 listed\)"):
-        BopReader(scene.root, [block(2)], "test")
+    refused(r"no image under .* \(2 listed\)")
     (scene.folder / "scene_camera.json").unlink()
-    with pytest.raises(UserError, match=r"scene_camera\.json, no such file"):
-        BopReader(scene.root, [block(2)], "test")
+    refused(r"scene_camera\.json, no such file")
 
 
 def test_palettes_alpha_and_single_bits_are_decoded():
-    grey = Image.fromarray(np.zeros((4, 5), np.uint8))
-
     def saved(mode):
         buffer = io.BytesIO()
-        grey.convert(mode).save(buffer, "PNG")
+        Image.new("L", (5, 4)).convert(mode).save(buffer, "PNG")
         return buffer.getvalue()
 
-    assert decode_rgb(saved("P"), "x").shape == (4, 5, 3)
-    assert decode_rgb(saved("RGBA"), "x").shape == (4, 5, 3)
+    for mode in ("P", "RGBA"):
+        assert decode_rgb(saved(mode), "x").shape == (4, 5, 3)
     assert not decode_mask(saved("1"), "x", (4, 5)).any()
     with pytest.raises(UserError, match="type RGB"):
         decode_mask(encode_png(np.zeros((4, 5, 3), np.uint8)), "x", (4, 5))

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop import bop_results
 from dopepp.data.formats.bop.bop_results import BopResult, read_results, results_name, write_results
+from dopepp.geometry.camera import make_transform
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
-R = "1 0 0 0 0 -1 0 1 0"
-GOOD = f"1,4,2,0.75,{R},-10.5 20 812.25,0.5"
+R, T = "1 0 0 0 0 -1 0 1 0", "-10.5 20 812.25"
+GOOD = f"1,4,2,0.75,{R},{T},0.5"
 
 BY_HAND = f"""{HEADER}
 {GOOD}
@@ -30,13 +31,13 @@ def write(folder: Path, content: str | bytes) -> Path:
 
 
 def test_a_file_in_the_toolkits_format(tmp_path):
-    first, second, third = read_results(write(tmp_path, BY_HAND), {2, 21})
-    assert (first.scene_id, first.im_id, first.obj_id, first.score) == (1, 4, 2, 0.75)
+    results = read_results(write(tmp_path, BY_HAND), {2, 21})
+    assert [(r.scene_id, r.im_id, r.obj_id, r.score, r.seconds) for r in results] == [
+        (1, 4, 2, 0.75, 0.5), (1, 4, 2, 0.25, 0.5), (48, 1000, 21, -3, -1),
+    ]  # fmt: skip
     expected = np.array([[1, 0, 0, -0.0105], [0, 0, -1, 0.02], [0, 1, 0, 0.81225], [0, 0, 0, 1]])
-    np.testing.assert_allclose(first.T_cam_obj, expected, atol=1e-15)
-    np.testing.assert_allclose(second.T_cam_obj[:3, 3], [0.1, -0.025, 0.9], atol=1e-15)
-    assert (first.seconds, third.seconds) == (0.5, -1)
-    assert (third.scene_id, third.im_id, third.obj_id, third.score) == (48, 1000, 21, -3)
+    np.testing.assert_allclose(results[0].T_cam_obj, expected, atol=1e-15)
+    np.testing.assert_allclose(results[1].T_cam_obj[:3, 3], [0.1, -0.025, 0.9], atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -59,9 +60,7 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
     rng = np.random.default_rng(seed)
     results = []
     for number in range(count):
-        T = np.eye(4)
-        T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
-        T[:3, 3] = rng.normal([0, 0, 1], 0.2)
+        T = make_transform(Rotation.random(rng=rng).as_matrix(), rng.normal([0, 0, 1], 0.2))
         results.append(BopResult(number // 5, number % 5, 1 + number % 3, rng.normal(), T, 0.1))
     path = tmp_path_factory.mktemp("results") / "out.csv"
     write_results(path, results)
@@ -95,14 +94,8 @@ def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
         (GOOD.replace("-10.5", "1e12"), r"line 2: t .*; allowed: millimetres"),
         (GOOD.replace("812.25,0.5", "812.25,-2"), r"line 2: time '-2'; allowed: seconds, or -1"),
         (GOOD.replace("812.25,0.5", "812.25,inf"), r"line 2: time: 'inf'"),
-        (
-            GOOD.replace("-10.5 20 812.25", "-0.01 0.02 0.81"),
-            r"median length of 0\.8103, e\.g\. in line 2.*metres",
-        ),
-        (
-            GOOD.replace("-10.5 20 812.25", "0 0 812250"),
-            r"median length of 8\.\d+e\+05, e\.g\. in line 2",
-        ),
+        (GOOD.replace(T, "-0.01 0.02 0.81"), r"median length of 0\.8103, e\.g\. in line 2.*metres"),
+        (GOOD.replace(T, "0 0 812250"), r"median length of 8\.\d+e\+05, e\.g\. in line 2"),
         (f"{GOOD}\n1,5,2,0.75,{R},0 0 700,1\n{GOOD}", r"line 4, which repeats line 2;.*once"),
         (GOOD + "é", r"line 2, which is not ASCII text"),
         (GOOD.replace("0.75", "0" * 5000), r"line 2 of more than 4096 bytes"),
@@ -123,18 +116,19 @@ def test_a_pose_may_be_repeated_with_another_score(tmp_path):
     assert len(read_results(write(tmp_path, f"{GOOD}\n{again}"), {2})) == 2
 
 
-def test_other_files_are_rejected(tmp_path, monkeypatch):
-    for path in (tmp_path / "none.csv", tmp_path):
-        with pytest.raises(UserError, match=r"no such file"):
-            read_results(path, {1})
-    with pytest.raises(UserError, match=r"which is empty"):
-        read_results(write(tmp_path, ""), {1})
-    with pytest.raises(UserError, match=r"line 1"):
-        read_results(write(tmp_path, b"\x89PNG\r\n\x1a\n" + bytes(10_000)), {1})
+@pytest.mark.parametrize(("content", "message"), [
+    ("", "which is empty"),
+    (b"\x89PNG\r\n\x1a\n" + bytes(10_000), "line 1"),
+    ("\n".join(GOOD.replace("0.75", f"0.{n}") for n in (1, 2, 3)),
+     "line 3; allowed: at most 2 poses"),
+    (None, "no such file"),
+], ids=["empty", "binary", "too many", "missing"])  # fmt: skip
+def test_other_files_are_rejected(content, message, tmp_path, monkeypatch):
     monkeypatch.setattr(bop_results, "MAX_ROWS", 2)
-    lines = [GOOD.replace("0.75", f"0.{number}") for number in (1, 2, 3)]
-    with pytest.raises(UserError, match=r"line 3; allowed: at most 2 poses"):
-        read_results(write(tmp_path, "\n".join(lines)), {2})
+    paths = [tmp_path, tmp_path / "none.csv"] if content is None else [write(tmp_path, content)]
+    for path in paths:
+        with pytest.raises(UserError, match=message):
+            read_results(path, {2})
 
 
 @pytest.mark.parametrize(

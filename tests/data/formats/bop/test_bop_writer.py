@@ -10,8 +10,9 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.bop_writer import BopWriter, make_labels
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import Part, make_part
 from dopepp.virtual.surface import make_surface
+from tests.data.makers import mesh_of, pose_at, write_set
 
 K = camera_matrix(100.0, 100.0, 15.5, 11.5)
 
@@ -19,14 +20,12 @@ K = camera_matrix(100.0, 100.0, 15.5, 11.5)
 @pytest.fixture(scope="module")
 def plate():
     """A plate of 40 × 20 mm."""
-    box = trimesh.creation.box((0.040, 0.020, 0.002))
-    return make_part("plate", Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
+    return make_part("plate", mesh_of(trimesh.creation.box((0.040, 0.020, 0.002))))
 
 
-def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path, write_set):
+def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path):
     # The plate faces the camera at 200 mm, 0.5 px/mm: 20 px × 10 px.
-    T = np.eye(4)
-    T[:3, 3] = 0.0, 0.0, 0.201
+    T = pose_at(0.0, 0.0, 0.201)
     visible = np.zeros((24, 32), bool)
     visible[7:17, 10:20] = True  # the left half
     depth = np.where(visible, 0.2, 0.0).astype(np.float32)
@@ -63,21 +62,18 @@ def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path, write_set):
 
 def test_truncated_hidden_and_far_objects(plate):
     surfaces = {"plate": (plate, make_surface(plate.mesh))}
-    T = np.eye(4)
-    T[:3, 3] = -0.0305, 0.0, 0.201  # columns −9.75 … 10.25
+    T = pose_at(-0.0305, 0.0, 0.201)  # columns −9.75 … 10.25
     visible = np.zeros((24, 32), bool)
     visible[7:17, :11] = True
-    hidden = np.zeros_like(visible)
     depth = np.where(visible, 20.0, 0.0).astype(np.float32)
     instance = Instance("plate", T, project_keypoints(plate.cuboid, T, K), 0.5, visible)
-    instances = [instance, replace(instance, visible_fraction=0.0, mask=hidden)]
+    instances = [instance, replace(instance, visible_fraction=0.0, mask=np.zeros_like(visible))]
     image = np.zeros((24, 32, 3), np.uint8)
     labels = make_labels(Sample(image, K, instances, depth), {"plate": 1}, surfaces)
-    assert labels.infos[0]["bbox_obj"] == [-9, 7, 19, 9]
-    assert labels.infos[0]["bbox_visib"] == [0, 7, 10, 9]
-    assert labels.infos[0]["px_count_all"] == 200
-    assert labels.infos[1]["bbox_obj"] == labels.infos[1]["bbox_visib"] == [-1, -1, -1, -1]
-    assert labels.infos[1]["px_count_visib"] == 0
+    seen, hidden = labels.infos
+    assert (seen["bbox_obj"], seen["bbox_visib"]) == ([-9, 7, 19, 9], [0, 7, 10, 9])
+    assert (seen["px_count_all"], hidden["px_count_visib"]) == (200, 0)
+    assert hidden["bbox_obj"] == hidden["bbox_visib"] == [-1, -1, -1, -1]
     # 20 m do not fit into 16 bits of 0.1 mm.
     assert (labels.camera["depth_scale"], labels.depth[10, 5]) == (1.0, 20_000)
 
@@ -85,12 +81,13 @@ def test_truncated_hidden_and_far_objects(plate):
 def test_a_folder_of_other_data_is_rejected(boxes, tmp_path):
     parts = boxes[0]
     BopWriter(tmp_path / "a", parts).prepare()
-    with pytest.raises(UserError, match=r"models_info\.json, written for other parts"):
-        BopWriter(tmp_path / "a", parts[:1]).prepare()
     (tmp_path / "b" / "train_pbr").mkdir(parents=True)
-    with pytest.raises(UserError, match=r"has train_pbr/ and no models"):
-        BopWriter(tmp_path / "b", parts).prepare()
     bare = Part("bare", parts[0].cuboid, 0.1, parts[0].points)
-    with pytest.raises(UserError, match="part bare without a mesh"):
-        BopWriter(tmp_path / "c", [bare]).prepare()
+    for folder, given, message in (
+        ("a", parts[:1], r"models_info\.json, written for other parts"),
+        ("b", parts, "has train_pbr/ and no models"),
+        ("c", [bare], "part bare without a mesh"),
+    ):
+        with pytest.raises(UserError, match=message):
+            BopWriter(tmp_path / folder, given).prepare()
     assert not (tmp_path / "c").exists()

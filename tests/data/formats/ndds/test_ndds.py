@@ -2,7 +2,6 @@
 
 import json
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.data.formats.ndds.ndds_reader import NddsReader
 from dopepp.data.formats.ndds.ndds_writer import NddsWriter
-from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part
+from tests.data.makers import edit_json, pose_at, write_set
 
 WIDTH, HEIGHT = 160, 120
 K = camera_matrix(180.0, 181.0, 79.0, 60.5)
@@ -38,14 +38,12 @@ CUBE = make_box("cube", (0.06, 0.06, 0.06), (0.0, 0.0, 0.0))
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    T[:3, 3] = [*rng.uniform(-0.04, 0.04, 2), rng.uniform(0.35, 0.6)]
-    return T
+    place = [*rng.uniform(-0.04, 0.04, 2), rng.uniform(0.35, 0.6)]
+    return make_transform(Rotation.random(rng=rng).as_matrix(), np.array(place))
 
 
 @pytest.fixture
-def written(tmp_path, write_set, boxes):
+def written(tmp_path, boxes):
     parts, samples = boxes
     return write_set(NddsWriter, tmp_path / "set", parts, samples), parts, samples
 
@@ -88,7 +86,7 @@ def test_fields_agree_with_their_documentation(written):
     np.testing.assert_allclose(exported[0]["cuboid_dimensions"], [6, 4, 2.4])
 
 
-def test_settings_are_written_for_one_camera_only(tmp_path, write_set, boxes):
+def test_settings_are_written_for_one_camera_only(tmp_path, boxes):
     parts, (first, second, _) = boxes
     other = replace(second, K=camera_matrix(200.0, 200.0, 79.0, 60.0))
     write_set(NddsWriter, tmp_path, parts, [first, other])
@@ -103,33 +101,32 @@ def test_settings_are_written_for_one_camera_only(tmp_path, write_set, boxes):
 def test_the_writer_rejects_folders_of_other_data(tmp_path, boxes):
     for _ in range(2):
         NddsWriter(tmp_path / "a", boxes[0]).prepare()
-    with pytest.raises(UserError, match=r"_object_settings\.json of other parts"):
-        NddsWriter(tmp_path / "a", boxes[0][:1]).prepare()
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "holiday.jpg").touch()
-    with pytest.raises(UserError, match=r"holiday\.jpg in .*/b, which is not from an NDDS writer"):
-        NddsWriter(tmp_path / "b", boxes[0]).prepare()
+    for folder, parts, message in (
+        ("a", boxes[0][:1], r"_object_settings\.json of other parts"),
+        ("b", boxes[0], r"holiday\.jpg in .*/b, which is not from an NDDS writer"),
+    ):
+        with pytest.raises(UserError, match=message):
+            NddsWriter(tmp_path / folder, parts).prepare()
 
 
-def test_samples_without_masks_depth_or_instances(tmp_path, write_set, boxes):
+def test_samples_without_masks_depth_or_instances(tmp_path, boxes):
     parts, (first, second, _) = boxes
     bare = replace(first, depth=None, instances=[replace(first.instances[0], mask=None)])
     write_set(NddsWriter, tmp_path, parts, [bare, replace(second, instances=[])])
-    source = NddsReader(tmp_path, parts)
-    assert source.sample(0).depth is None
-    assert source.sample(0).instances[0].mask is None
-    assert source.sample(1).instances == []
+    read, empty = (NddsReader(tmp_path, parts).sample(index) for index in (0, 1))
+    assert (read.depth, read.instances[0].mask, empty.instances) == (None, None, [])
 
 
-def test_a_corner_behind_the_camera_is_written_finitely(tmp_path, write_set, boxes):
-    (part, _), samples = boxes
-    T = samples[0].instances[0].T_cam_obj.copy()
-    T[:3, 3] = [0, 0, 0.02]
-    keypoints = project_keypoints(part.cuboid, T, samples[0].K)
+def test_a_corner_behind_the_camera_is_written_finitely(tmp_path, boxes):
+    (part, _), (sample, *others) = boxes
+    first, second = sample.instances
+    T = make_transform(first.T_cam_obj[:3, :3], np.array([0, 0, 0.02]))
+    keypoints = project_keypoints(part.cuboid, T, sample.K)
     assert np.isnan(keypoints).any()
-    near = replace(samples[0].instances[0], T_cam_obj=T, keypoints=keypoints)
-    near = replace(samples[0], instances=[near, samples[0].instances[1]])
-    write_set(NddsWriter, tmp_path, boxes[0], [near, *samples[1:]])
+    near = replace(first, T_cam_obj=T, keypoints=keypoints)
+    write_set(NddsWriter, tmp_path, boxes[0], [replace(sample, instances=[near, second]), *others])
     back = NddsReader(tmp_path, boxes[0]).sample(0).instances[0]
     np.testing.assert_allclose(back.T_cam_obj, T, atol=1e-12)
     np.testing.assert_allclose(back.keypoints, keypoints, atol=1e-6)
@@ -241,25 +238,24 @@ def assert_read(foreign: ForeignWriter, source: NddsReader, atol: float = 1e-6) 
 
 
 QUARTER = np.array([[0, -1, 0, 0.02], [0, 0, -1, 0.05], [1, 0, 0, -0.01], [0, 0, 0, 1.0]])
-SLANTED = np.eye(4)
+SLANTED = make_transform(
+    Rotation.from_euler("xyz", [80, 23, -12], degrees=True).as_matrix(),
+    np.array([0.013, -0.04, 0.02]),
+)
 SLANTED[:3, :3] = Rotation.from_euler("xyz", [80, 23, -12], degrees=True).as_matrix()
 SLANTED[:3, 3] = [0.013, -0.04, 0.02]
 
 
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("unit", ["cm", "m", "mm"])
-@pytest.mark.parametrize(
-    ("convention", "frame"),
-    [
-        ({}, "mesh"),
-        ({"opengl": True, "nine": True}, "mesh"),
-        ({"front_x": True, "nine": True}, "mesh, front x"),
-        ({"front_x": True, "nine": True, "opengl": True}, "mesh, front x"),
-        ({"fixed": QUARTER}, "fixed"),
-        ({"fixed": SLANTED}, "fixed"),
-    ],
-    ids=["plain", "opengl", "nvisii", "old-nvisii", "fixed", "fixed-slanted"],
-)
+@pytest.mark.parametrize(("convention", "frame"), [
+    ({}, "mesh"),
+    ({"opengl": True, "nine": True}, "mesh"),
+    ({"front_x": True, "nine": True}, "mesh, front x"),
+    ({"front_x": True, "nine": True, "opengl": True}, "mesh, front x"),
+    ({"fixed": QUARTER}, "fixed"),
+    ({"fixed": SLANTED}, "fixed"),
+], ids=["plain", "opengl", "nvisii", "old-nvisii", "fixed", "fixed-slanted"])  # fmt: skip
 def test_every_convention_is_determined(tmp_path, order, unit, convention, frame, caplog):
     foreign = ForeignWriter(tmp_path, order=order, unit=unit, **convention)
     foreign.items(3, BOX, CUBE)
@@ -313,9 +309,7 @@ def test_falling_things(tmp_path):
 
 def test_meshes_centred_at_their_box(tmp_path):
     """Poses refer to the mesh with its box's centre at the origin, which no field states."""
-    centre = np.eye(4)
-    centre[:3, 3] = -BOX.cuboid[8]
-    foreign = ForeignWriter(tmp_path, fixed=centre, unit="m")
+    foreign = ForeignWriter(tmp_path, fixed=pose_at(*-BOX.cuboid[8]), unit="m")
     foreign.items(4, BOX)
     source = NddsReader(tmp_path, [BOX])
     assert source.finding.convention.frame == "centred"
@@ -332,24 +326,19 @@ def test_noise_in_the_projections(tmp_path):
 
 
 def test_indistinguishable_orders_are_logged(tmp_path):
-    foreign, T = ForeignWriter(tmp_path), np.eye(4)
-    T[:3, :3] = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
-    T[:3, 3] = [0.01, 0.0, 0.4]
-    foreign.item(0, BOX, pose=T)
+    foreign, turn = ForeignWriter(tmp_path), Rotation.from_quat([0.5, 0.5, 0.5, 0.5])
+    foreign.item(0, BOX, pose=make_transform(turn.as_matrix(), np.array([0.01, 0.0, 0.4])))
     source = NddsReader(tmp_path, [BOX])
     assert_read(foreign, source)
     assert "equal poses under: quaternion w,x,y,z" in str(source.finding)
 
 
-def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    record = json.loads(path.read_text())
-    change(record["objects"][0])
-    path.write_text(json.dumps(record))
-
-
 def test_an_item_with_another_convention_is_rejected(tmp_path):
-    paths = ForeignWriter(tmp_path).items(12, BOX)
-    edit(paths[7], lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
+    def roll(record):
+        quaternion = record["objects"][0]["quaternion_xyzw"]
+        quaternion.insert(0, quaternion.pop())
+
+    edit_json(ForeignWriter(tmp_path).items(12, BOX)[7], roll)
     source = NddsReader(tmp_path, [BOX])
     source.sample(6)
     with pytest.raises(UserError, match=r"000007\.json: objects\[0\]\.projected_cuboid: .* px"):
@@ -363,61 +352,57 @@ def test_no_convention_fits(tmp_path):
         NddsReader(tmp_path, [inch])
 
 
-def test_visible_fraction_of_a_truncated_object(tmp_path):
-    for visibility in (1, 0.5, -1, None):
-        foreign, T = ForeignWriter(tmp_path / str(visibility), visibility=visibility), np.eye(4)
-        # The centre of the face towards the camera is on the left border.
-        T[:3, 3] = [(-0.5 - 79.0) / 180 * 0.4 - BOX.cuboid[8, 0], 0, 0.4]
-        foreign.item(0, BOX, pose=T)
-        (instance,) = NddsReader(foreign.root, [BOX]).sample(0).instances
-        expected = 0.5 * (0.5 if visibility == 0.5 else 1)
-        assert instance.visible_fraction == pytest.approx(expected, abs=0.05)
+@pytest.mark.parametrize(("visibility", "share"), [(1, 1), (0.5, 0.5), (-1, 1), (None, 1)])
+def test_visible_fraction_of_a_truncated_object(visibility, share, tmp_path):
+    # The centre of the face towards the camera is on the left border.
+    T = pose_at((-0.5 - 79.0) / 180 * 0.4 - BOX.cuboid[8, 0], 0, 0.4)
+    ForeignWriter(tmp_path, visibility=visibility).item(0, BOX, pose=T)
+    (instance,) = NddsReader(tmp_path, [BOX]).sample(0).instances
+    assert instance.visible_fraction == pytest.approx(0.5 * share, abs=0.05)
 
 
 def test_other_classes_and_hidden_objects_are_ignored_and_counted(tmp_path):
-    ForeignWriter(tmp_path).items(3, BOX, CUBE)
+    def behind(record):
+        record["objects"][0]["location"][2] *= -1
+        record["objects"][0]["visibility"] = 0
 
-    def behind(item):
-        item["location"][2] *= -1
-        item["visibility"] = 0
-
-    edit(tmp_path / "000002.json", behind)
+    edit_json(ForeignWriter(tmp_path).items(3, BOX, CUBE)[2], behind)
     source = NddsReader(tmp_path, [BOX])
     (info,) = source.describe()
     assert info.num_instances == {"box": 2}
     assert info.identity["left out"] == {"box, behind the camera": 1, "cube": 3}
-    assert source.sample(2).instances == []
-    assert [i.label for i in source.sample(0).instances] == ["box"]
-    assert source.contains("box")
-    assert not source.contains("cube")
+    assert [[i.label for i in source.sample(n).instances] for n in (0, 2)] == [["box"], []]
+    assert (source.contains("box"), source.contains("cube")) == (True, False)
     dice = make_box("dice", (0.06,) * 3, (0.0,) * 3)
     renamed = NddsReader(tmp_path, [dice], classes={"cube": "dice"})
     assert [i.label for i in renamed.sample(0).instances] == ["dice"]
-    with pytest.raises(UserError, match=r"classes of the parts \['dice'\]"):
-        NddsReader(tmp_path, [BOX], classes={"cube": "dice"})
-    with pytest.raises(UserError, match=r"of the parts dice.*other classes: .*box \(3\)"):
-        NddsReader(tmp_path, [dice])
+    for part, classes, message in (
+        (BOX, {"cube": "dice"}, r"classes of the parts \['dice'\]"),
+        (dice, None, r"of the parts dice.*other classes: .*box \(3\)"),
+    ):
+        with pytest.raises(UserError, match=message):
+            NddsReader(tmp_path, [part], classes=classes)
 
 
 def test_missing_camera_images_and_folders(tmp_path, caplog):
+    def refused(message, folder=tmp_path / "set"):
+        with pytest.raises(UserError, match=message):
+            NddsReader(folder, [BOX])
+
     foreign = ForeignWriter(tmp_path / "set", own_camera=False)
     foreign.item(0, BOX)
-    with pytest.raises(UserError, match=r"camera_data\.intrinsics: 0 cameras.*_camera_settings"):
-        NddsReader(foreign.root, [BOX])
+    refused(r"camera_data\.intrinsics: 0 cameras.*_camera_settings")
     foreign.cameras("one", "two")
-    with pytest.raises(UserError, match=r"camera_data\.intrinsics: 2 cameras"):
-        NddsReader(foreign.root, [BOX])
+    refused(r"camera_data\.intrinsics: 2 cameras")
     foreign.cameras("one")
     foreign.item(1, BOX)
     (foreign.root / "000001.png").unlink()
     with caplog.at_level(logging.WARNING):
         assert len(NddsReader(foreign.root, [BOX])) == 1
     assert "ignoring 1 annotations without an image" in caplog.text
-    for folder in (tmp_path / "nowhere", tmp_path):
-        if folder == tmp_path:
-            (foreign.root / "000000.png").unlink()
-        with pytest.raises(UserError, match="without an annotated image"):
-            NddsReader(folder, [BOX])
+    refused("without an annotated image", tmp_path / "nowhere")
+    (foreign.root / "000000.png").unlink()
+    refused("without an annotated image", tmp_path)
 
 
 def test_image_of_another_size_than_its_camera(tmp_path):

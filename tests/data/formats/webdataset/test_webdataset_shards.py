@@ -18,12 +18,13 @@ from dopepp.data.formats.problems import STRICT, Node
 from dopepp.data.formats.webdataset import index_shard, members
 from dopepp.data.formats.webdataset.webdataset_reader import WebdatasetReader
 from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
+from tests.data.makers import block, contents, write_set, write_tar
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 
 
 @pytest.fixture
-def written(parts, samples, tmp_path, write_set):
+def written(parts, samples, tmp_path):
     """Write four images in two shards."""
     return write_set(WebdatasetWriter, tmp_path / "rendered", parts, samples, 998)
 
@@ -115,77 +116,88 @@ def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
     return [*texts, (f"{key}.rgb.jpg", image)]
 
 
-def test_reads_a_shard_of_another_writer(tmp_path, block, write_shard):
-    files = [("./" + name, data) for name, data in image_files("000001_000005")]
-    files += image_files("000000_000007", gt_json=None, gt_info_json=None)
+def test_reads_a_shard_of_another_writer(tmp_path):
     folder = tarfile.TarInfo("some")
     folder.type = tarfile.DIRTYPE
-    long = image_files("some/" + "x" * 150)
-    files = [(folder, b""), *files, ("__meta__", b"x"), *long]
+    files = [
+        (folder, b""),
+        *(("./" + name, data) for name, data in image_files("000001_000005")),
+        *image_files("000000_000007", gt_json=None, gt_info_json=None),
+        ("__meta__", b"x"),
+        *image_files("some/" + "x" * 150),
+    ]
     for kind in (tarfile.PAX_FORMAT, tarfile.GNU_FORMAT):
-        write_shard(tmp_path / "shard-000000.tar", files, format=kind)
+        write_tar(tmp_path / "shard-000000.tar", files, format=kind)
         source = WebdatasetReader(tmp_path, [block(2)])
         samples = [source.sample(index) for index in range(len(source))]
-        keys = [sample.key[:20] for sample in samples]
-        assert keys == ["000001_000005", "000000_000007", "some/" + "x" * 15]
-        assert [len(sample.instances) for sample in samples] == [1, 0, 1]
+        assert [(sample.key[:20], len(sample.instances)) for sample in samples] == [
+            ("000001_000005", 1), ("000000_000007", 0), ("some/" + "x" * 15, 1),
+        ]  # fmt: skip
         (instance,) = samples[0].instances
         np.testing.assert_allclose(instance.T_cam_obj[:3, 3], [0.005, -0.01, 0.25])
         np.testing.assert_allclose(instance.keypoints[8], [33.5, 19.46])
         assert (instance.visible_fraction, instance.mask, samples[0].depth) == (0.5, None, None)
 
 
-def test_hostile_members_are_rejected(tmp_path, write_shard):
-    good = image_files("000000_000000")
-
-    def refused(message, files):
-        path = write_shard(tmp_path / "s" / "shard-000000.tar", files)
-        with pytest.raises(UserError, match=message) as caught:
-            index_shard(path)
-        assert "shard-000000.tar" in str(caught.value)
-
-    for name in ("../000000_000001.rgb.png", "/etc/x.rgb.png", "a/../../b.rgb.png", "a\\b.rgb.png"):
-        refused("leads out of the archive", [*good, (name, b"x")])
-    for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE):
-        link = tarfile.TarInfo("000000_000001.rgb.png")
-        link.type, link.linkname = kind, "/etc/passwd"
-        refused("a link, a device", [*good, (link, b"")])
-    refused("'000000_000000.rgb.jpg' twice", [*good, good[-1]])
-    refused("two members for its image", [*good, ("000000_000000.rgb.png", b"x")])
-    refused("000000_000000 without rgb", good[:-1])
-    refused("000000_000000 without camera", good[1:])
-    refused("which is not KEY.EXTENSION", [*good, ("README", b"x")])
+def link(kind: bytes) -> tarfile.TarInfo:
+    info = tarfile.TarInfo("000000_000001.rgb.png")
+    info.type, info.linkname = kind, "/etc/passwd"
+    return info
 
 
-def test_truncated_damaged_and_oversized_archives_are_rejected(tmp_path, write_shard):
+COMPLETE = image_files("000000_000000")
+
+
+OUTSIDE = ("../000000_000001.rgb.png", "/etc/x.rgb.png", "a/../../b.rgb.png", "a\\b.rgb.png")
+
+
+KINDS = (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE)
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        *(([*COMPLETE, (name, b"x")], "leads out of the archive") for name in OUTSIDE),
+        *(([*COMPLETE, (link(kind), b"")], "a link, a device") for kind in KINDS),
+        ([*COMPLETE, COMPLETE[-1]], "'000000_000000.rgb.jpg' twice"),
+        ([*COMPLETE, ("000000_000000.rgb.png", b"x")], "two members for its image"),
+        (COMPLETE[:-1], "000000_000000 without rgb"),
+        (COMPLETE[1:], "000000_000000 without camera"),
+        ([*COMPLETE, ("README", b"x")], "which is not KEY.EXTENSION"),
+    ],
+)
+def test_hostile_members_are_rejected(files, message, tmp_path):
+    with pytest.raises(UserError, match=message) as caught:
+        index_shard(write_tar(tmp_path / "shard-000000.tar", files))
+    assert "shard-000000.tar" in str(caught.value)
+
+
+def test_truncated_damaged_and_oversized_archives_are_rejected(tmp_path):
     files = image_files("000000_000000") + image_files("000000_000001")
-    path = write_shard(tmp_path / "shard-000000.tar", files)
+    path = write_tar(tmp_path / "shard-000000.tar", files)
     whole = path.read_bytes()
     with tarfile.open(path) as archive:
         infos = archive.getmembers()
+
+    def refused(content, message):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=message):
+            index_shard(path)
+
     ends = [info.offset for info in infos[1:]] + [infos[-1].offset_data + infos[-1].size]
     for length in (0, 100, 512, *ends, infos[3].offset_data + 5, infos[-1].offset_data + 200):
-        path.write_bytes(whole[:length])
-        with pytest.raises(UserError, match=r"shard-000000\.tar"):
-            index_shard(path)
+        refused(whole[:length], r"shard-000000\.tar")
     for start in (infos[0].offset, infos[3].offset, infos[-1].offset):
         damaged = bytearray(whole)
         damaged[start + 150] ^= 0x55  # within the header's checksum
-        path.write_bytes(bytes(damaged))
-        with pytest.raises(UserError, match="damaged"):
-            index_shard(path)
-    bomb = tarfile.TarInfo("000000_000002.rgb.png")
+        refused(damaged, "damaged")
+    bomb, long_name = tarfile.TarInfo("000000_000002.rgb.png"), tarfile.TarInfo("././@LongLink")
     bomb.size = 1 << 40
-    long_name = tarfile.TarInfo("././@LongLink")
     long_name.type, long_name.size = tarfile.GNUTYPE_LONGNAME, 1 << 32
-    for content, message in (
-        (whole[: ends[-1] + -ends[-1] % 512] + bomb.tobuf(), r"2\.rgb\.png' of 1,099,512 MB"),
-        (long_name.tobuf(), r"a header of \d+ bytes"),
-        (gzip.compress(whole), "a compressed archive"),
-    ):
-        path.write_bytes(content + bytes(10_240))
-        with pytest.raises(UserError, match=message):
-            index_shard(path)
+    end = whole[: ends[-1] + -ends[-1] % 512]
+    refused(end + bomb.tobuf() + bytes(10_240), r"2\.rgb\.png' of 1,099,512 MB")
+    refused(long_name.tobuf() + bytes(10_240), r"a header of \d+ bytes")
+    refused(gzip.compress(whole) + bytes(10_240), "a compressed archive")
     path.write_bytes(whole)
     index = index_shard(path)
     path.write_bytes(whole[:3000])
@@ -193,35 +205,38 @@ def test_truncated_damaged_and_oversized_archives_are_rejected(tmp_path, write_s
         index.read(1, "image")
 
 
-def test_a_key_in_two_shards_and_wrong_paths(tmp_path, block, write_shard):
+@pytest.fixture
+def two_shards(tmp_path):
     for name in ("shard-000000.tar", "shard-000001.tar"):
-        write_shard(tmp_path / "a" / name, image_files("000000_000000"))
-    with pytest.raises(
-        UserError, match=r"shard-000001\.tar, which repeats 1 keys of .*-000000\.tar"
-    ):
-        WebdatasetReader(tmp_path, [block(2)], "a")
-    source = WebdatasetReader(tmp_path, [block(2)], "a/shard-000001.tar")
-    assert len(source) == 1
-    braces = WebdatasetReader(tmp_path, [block(2)], "a/shard-00000{1..1}.tar")
-    assert braces.describe()[0].identity == source.describe()[0].identity
-    for shards, message in {
-        "b": "no such file or folder",
-        "a/shard-{000001..000002}.tar": r"shard-000002\.tar, no such file",
-        "a/{1..999999999}.tar": "at most 100,000 shards",
-        "a/" + "{a,b}" * 40: "at most 100,000 shards",
-        "a/" + "x" * 5000: "at most 100,000 shards",
-        "a/{000000": "Unbalanced braces",
-        "https://host/shard-000000.tar": "which are not on this machine.*download_dir",
-        "pipe:touch hacked": "a command to run",
-        "PIPE:touch hacked": "a command to run",
-    }.items():
-        with pytest.raises(UserError, match=message):
-            WebdatasetReader(tmp_path, [block(2)], shards)
+        write_tar(tmp_path / "a" / name, COMPLETE)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"a folder without \*\.tar"):
-        WebdatasetReader(tmp_path, [block(2)], "empty")
-    with pytest.raises(UserError, match=r"shard-000000\.tar twice"):
-        WebdatasetReader(tmp_path, [block(2)], "a/shard-00000{0,0}.tar")
+    return tmp_path
+
+
+def test_single_shards_and_braces(two_shards):
+    source = WebdatasetReader(two_shards, [block(2)], "a/shard-000001.tar")
+    assert len(source) == 1
+    braces = WebdatasetReader(two_shards, [block(2)], "a/shard-00000{1..1}.tar")
+    assert braces.describe()[0].identity == source.describe()[0].identity
+
+
+@pytest.mark.parametrize(("shards", "message"), [
+    ("a", r"shard-000001\.tar, which repeats 1 keys of .*-000000\.tar"),
+    ("a/shard-00000{0,0}.tar", r"shard-000000\.tar twice"),
+    ("empty", r"a folder without \*\.tar"),
+    ("b", "no such file or folder"),
+    ("a/shard-{000001..000002}.tar", r"shard-000002\.tar, no such file"),
+    ("a/{1..999999999}.tar", "at most 100,000 shards"),
+    ("a/" + "{a,b}" * 40, "at most 100,000 shards"),
+    ("a/" + "x" * 5000, "at most 100,000 shards"),
+    ("a/{000000", "Unbalanced braces"),
+    ("https://host/shard-000000.tar", "which are not on this machine.*download_dir"),
+    ("pipe:touch hacked", "a command to run"),
+    ("PIPE:touch hacked", "a command to run"),
+], ids=lambda text: text[:40])  # fmt: skip
+def test_repeated_keys_and_wrong_paths_are_rejected(shards, message, two_shards):
+    with pytest.raises(UserError, match=message):
+        WebdatasetReader(two_shards, [block(2)], shards)
 
 
 @pytest.fixture
@@ -233,24 +248,22 @@ def address(tmp_path):
         server.shutdown()
 
 
-def test_shards_are_downloaded_once_and_within_bounds(
-    address, tmp_path, contents, monkeypatch, block, write_shard
-):
+def test_shards_are_downloaded_once_within_bounds(address, tmp_path, monkeypatch):
+    def download(url=address + "/shard-{000000..000001}.tar", folder=tmp_path / "downloads"):
+        return WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
+
     for n in (0, 1):
-        write_shard(tmp_path / "served" / f"shard-{n:06d}.tar", image_files(f"00000{n}_000000"))
-    folder = tmp_path / "downloads"
-    url = address + "/shard-{000000..000001}.tar"
-    source = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
+        write_tar(tmp_path / "served" / f"shard-{n:06d}.tar", image_files(f"00000{n}_000000"))
+    source = download()
     assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
-    assert contents(folder) == contents(tmp_path / "served")
+    assert contents(tmp_path / "downloads") == contents(tmp_path / "served")
     monkeypatch.setattr("dopepp.data.formats.webdataset.webdataset_reader.MAX_SHARD_BYTES", 1000)
-    again = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
-    assert again.describe() == [source.describe()[0]]
-    with pytest.raises(UserError, match="of over 0 GB"):
-        WebdatasetReader(tmp_path, [block(2)], url, download_dir=tmp_path / "small")
-    missing = address + "/shard-000009.tar"
-    with pytest.raises(UserError, match="which cannot be downloaded"):
-        WebdatasetReader(tmp_path, [block(2)], missing, download_dir=folder)
-    with pytest.raises(UserError, match=r"URLs of .*https"):
-        WebdatasetReader(tmp_path, [block(2)], "nope://x/y.tar", download_dir=folder)
+    assert download().describe() == [source.describe()[0]]
+    for arguments, message in (
+        ({"folder": tmp_path / "small"}, "of over 0 GB"),
+        ({"url": address + "/shard-000009.tar"}, "which cannot be downloaded"),
+        ({"url": "nope://x/y.tar"}, "URLs of .*https"),
+    ):
+        with pytest.raises(UserError, match=message):
+            download(**arguments)
     assert list((tmp_path / "small").iterdir()) == []

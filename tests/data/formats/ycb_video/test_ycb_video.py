@@ -1,4 +1,5 @@
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,20 +31,21 @@ SYNTHETIC = {"frames": ["000000"], "subset": "synthetic", "backgrounds": Procedu
 
 
 def test_reads_pose_camera_depth_and_mask(ycb_tree, box):
+    def stored(what):
+        return cv2.imread(str(ycb_tree.path("0000/000001", what)), cv2.IMREAD_UNCHANGED)
+
     poses = ycb_tree.write("0000/000001", classes=(1, 2))
     sample = source_of(ycb_tree, box).sample(0)
     (instance,) = sample.instances
-    assert (instance.label, sample.source) == ("003_box", "ycb_video/data")
-    assert sample.key == "0000/000001"
+    names = (instance.label, sample.source, sample.key)
+    assert names == ("003_box", "ycb_video/data", "0000/000001")
     np.testing.assert_array_equal(instance.T_cam_obj[:3], poses[..., 1])
     expected, _ = cv2.projectPoints(box.cuboid, np.zeros(3), poses[:, 3, 1], ycb_tree.K, None)
     np.testing.assert_allclose(instance.keypoints, expected[:, 0], atol=1e-9)
     np.testing.assert_array_equal(sample.K, ycb_tree.K)
     np.testing.assert_allclose(sample.depth, 0.3, rtol=1e-6)
-    label = cv2.imread(str(ycb_tree.path("0000/000001", "label.png")), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(instance.mask, label == 2)
-    bgr = cv2.imread(str(ycb_tree.path("0000/000001", "color.png")))
-    np.testing.assert_array_equal(sample.image, bgr[..., ::-1])
+    np.testing.assert_array_equal(instance.mask, stored("label.png") == 2)
+    np.testing.assert_array_equal(sample.image, stored("color.png")[..., ::-1])
     assert source_of(ycb_tree, box, read_depth=False).sample(0).depth is None
 
 
@@ -99,25 +101,22 @@ def test_hidden_synthetic_object_has_fraction_zero(ycb_tree, box):
 
 
 def test_describe_and_contains(ycb_tree, box):
-    ycb_tree.write("0000/000001", classes=(2,))
-    ycb_tree.write("0000/000002", classes=(1,))
-    mug = replace(box, name="004_mug")
-    frames = ["0000/000002", "0000/000001"]
-    source = YcbVideoReader(ycb_tree.root, [box, mug], frames=frames)
-    assert source.contains("003_box")
-    assert not source.contains("004_mug")
-    assert not source.contains("no_such")
+    for frame, number in (("0000/000001", 2), ("0000/000002", 1)):
+        ycb_tree.write(frame, classes=(number,))
+    parts, frames = [box, replace(box, name="004_mug")], ["0000/000002", "0000/000001"]
+    source = YcbVideoReader(ycb_tree.root, parts, frames=frames)
+    contained = [source.contains(name) for name in ("003_box", "004_mug", "no_such")]
+    assert contained == [True, False, False]
     (info,) = source.describe()
     assert (info.num_images, info.num_instances) == (2, {"003_box": 1, "004_mug": 0})
-    (other,) = YcbVideoReader(ycb_tree.root, [box, mug], frames=frames[1:]).describe()
+    (other,) = YcbVideoReader(ycb_tree.root, parts, frames=frames[1:]).describe()
     assert info.identity != other.identity
 
 
 def test_hull_areas_against_trimesh_and_shapes():
     square = np.array([[-0.5, -0.5], [9.5, -0.5], [9.5, 9.5], [-0.5, 9.5], [4.0, 4.0]])
-    assert hull_areas(square, (100, 100)) == pytest.approx((100.0, 100.0))
-    assert hull_areas(square + np.array([95, 0]), (100, 100)) == pytest.approx((50.0, 100.0))
-    assert hull_areas(square + 500, (100, 100)) == pytest.approx((0.0, 100.0))
+    for shift, area in (([0, 0], 100.0), ([95, 0], 50.0), ([500, 500], 0.0)):
+        assert hull_areas(square + np.array(shift), (100, 100)) == pytest.approx((area, 100.0))
     assert hull_areas(np.full((5, 2), np.nan), (100, 100)) == (0.0, 0.0)
     cloud = np.random.default_rng(0).normal(50, 5, (200, 2))
     prism = np.vstack([np.c_[cloud, np.zeros(200)], np.c_[cloud, np.ones(200)]])
@@ -125,28 +124,28 @@ def test_hull_areas_against_trimesh_and_shapes():
     assert hull_areas(cloud, (100, 100))[1] == pytest.approx(volume, rel=1e-4)
 
 
-def test_root_that_is_missing_or_wrong(tmp_path, ycb_tree, box):
-    with pytest.raises(UserError, match=r"which is not a folder.*set data\.root"):
-        YcbVideoReader(tmp_path / "nowhere", [box], "train")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"empty, which has no data/.*a YCB-Video folder"):
-        YcbVideoReader(tmp_path / "empty", [box], "train")
-    (ycb_tree.root / "image_sets" / "classes.txt").unlink()
-    with pytest.raises(UserError, match=r"no image_sets/classes\.txt"):
-        YcbVideoReader(ycb_tree.root, [box], "train")
-
-
-def test_unknown_names_and_wrong_arguments_are_rejected(ycb_tree, box):
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"root": "nowhere"}, r"which is not a folder.*set data\.root"),
+    ({"root": "empty"}, r"empty, which has no data/.*a YCB-Video folder"),
+    ({"root": "bare"}, r"no image_sets/classes\.txt"),
+    ({"part": "servoholder"}, r"'servoholder'.*002_can.*003_box.*004_mug"),
+    ({"image_set": "trian"}, r"image set 'trian'; allowed: one of \['odd', 'train'\]"),
+    ({"image_set": "odd"}, r"odd\.txt: line 'colour\.png'"),
+    ({}, r"no frame of train\.txt.*2 listed.*at least one"),
+], ids=str)  # fmt: skip
+def test_wrong_roots_and_unknown_names_are_rejected(arguments, message, tmp_path, ycb_tree, box):
     ycb_tree.write_list("train", ["0007/000001", "0007/000002"])
     ycb_tree.write_list("odd", ["colour.png"])
-    for part, image_set, message in (
-        (replace(box, name="servoholder"), "train", r"'servoholder'.*002_can.*003_box.*004_mug"),
-        (box, "trian", r"image set 'trian'; allowed: one of \['odd', 'train'\]"),
-        (box, "odd", r"odd\.txt: line 'colour\.png'"),
-        (box, "train", r"no frame of train\.txt.*2 listed.*at least one"),
-    ):
-        with pytest.raises(UserError, match=message):
-            YcbVideoReader(ycb_tree.root, [part], image_set)
+    (tmp_path / "empty").mkdir()
+    shutil.copytree(ycb_tree.root, tmp_path / "bare")
+    (tmp_path / "bare" / "image_sets" / "classes.txt").unlink()
+    given = {"root": "ycb", "part": "003_box", "image_set": "train"} | arguments
+    part = replace(box, name=given["part"])
+    with pytest.raises(UserError, match=message):
+        YcbVideoReader(tmp_path / given["root"], [part], given["image_set"])
+
+
+def test_wrong_arguments_are_rejected(ycb_tree, box):
     with pytest.raises(ValueError, match="either image_set or frames"):
         YcbVideoReader(ycb_tree.root, [box])
     with pytest.raises(ValueError, match="give backgrounds"):
@@ -179,16 +178,15 @@ def test_projected_cuboid_covers_the_real_label_at_its_depth(ycb_root, frame, na
 
 
 def test_real_synthetic_frame_and_lists(ycb_root, caplog):
-    parts = [ycb_part_of(ycb_root, name) for name in ("003_cracker_box", "005_tomato_soup_can")]
-    train = YcbVideoReader(ycb_root, parts, "train")
-    assert train.frames == ["0000/000001", "0050/000003"]
+    names = ("003_cracker_box", "005_tomato_soup_can")
+    parts = [ycb_part_of(ycb_root, name) for name in names]
+    assert YcbVideoReader(ycb_root, parts, "train").frames == ["0000/000001", "0050/000003"]
     with caplog.at_level(logging.WARNING):
         test = YcbVideoReader(ycb_root, parts, "keyframe")
     assert "2,949 frames listed in keyframe.txt are absent; first: 0048/000001" in caplog.text
     assert 1 <= len(test) <= 3
-    synthetic = YcbVideoReader(
-        ycb_root, parts, "train", "synthetic", backgrounds=ProceduralBackgrounds()
-    )
+    backgrounds = ProceduralBackgrounds()
+    synthetic = YcbVideoReader(ycb_root, parts, "train", "synthetic", backgrounds=backgrounds)
     sample = synthetic.sample(0)
-    assert {instance.label for instance in sample.instances} <= {part.name for part in parts}
+    assert {instance.label for instance in sample.instances} <= set(names)
     assert sample.image.std() > 5
