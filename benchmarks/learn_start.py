@@ -3,9 +3,12 @@
     python benchmarks/learn_start.py data/start --minutes 6 [--parts 160] [--from auto]
 
 Random parts are bodies with bosses, ribs, holes and slots, similar to machined or printed parts. A
-single network learns the poses of all parts, with any in-plane rotation and tilts of up to 60°. The
-weights of all layers except the output layers, which are specific to the parts, are written to
-``dopepp_fast.safetensors`` in the folder, which also holds the parts' meshes.
+single network learns the poses of all parts: single parts with any in-plane rotation and tilts of
+up to 60°, and heaps (extra ``robot``). The weights of all layers except the output layers, which
+are specific to the parts, are written to ``dopepp_fast.safetensors`` in the folder, which also
+holds the parts' meshes.
+
+``--prepare`` only writes the meshes and the cached heaps, which takes about 20 s per part.
 """
 
 from __future__ import annotations
@@ -14,29 +17,65 @@ import argparse
 import itertools
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import trimesh
 from manifold3d import CrossSection, Manifold
 from runtimes import config_of
+from torch.utils.data import DataLoader, Dataset, Sampler
 
-from dopepp.data.batch import Batch
+from dopepp.core.pool import available_cores
+from dopepp.data.batch import Batch, collate
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.sample import Sample
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule
+from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
 from dopepp.experiment.assembly.build_system import build_system
+from dopepp.experiment.assembly.photos import training_backgrounds
+from dopepp.experiment.assembly.renders import training_renders
 from dopepp.models.network import PoseNetwork
 from dopepp.models.start import output_tensors
 from dopepp.models.storage import write_safetensors
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.training.system import PoseSystem
+from dopepp.virtual.body import make_body
 
 DIAMETERS_MM = (35.0, 60.0)
 _SEGMENTS = 48  # sides of a round feature
 _WARM_UP = 0.05  # share of the time in which the learning rate grows
-_WINDOWS = 250_000  # rendered once, with new augmentation in each epoch
+_PILES = 60  # heaps per block of images
+_BLOCK = 10_000  # images that share heaps
+_CAMERA = "{width: 640, height: 480, fx: 605.0, fy: 605.0, cx: 319.5, cy: 239.5}"
+_HEAP = (f"++virtual.scene.table.pile={{piles: {_PILES}, mixed_share: 0.2}}",)
+
+
+class Stream(NamedTuple):
+    """A kind of training images.
+
+    Attributes:
+        share: Share of the training images.
+        new_share: Share of new renders; the other images are former renders, augmented anew.
+        overrides: Options of ``train.py`` for the renders.
+    """
+
+    share: float
+    new_share: float
+    overrides: tuple[str, ...]
+
+
+STREAMS = (
+    Stream(0.4, 0.25, ("seen_on=front",)),
+    Stream(0.35, 0.12, ("seen_on=bin", "materials=mixed", *_HEAP)),
+    Stream(0.25, 0.12, ("seen_on=bin", "materials=metal", *_HEAP)),
+)
 
 
 def random_part(rng: np.random.Generator) -> trimesh.Trimesh:
@@ -61,8 +100,8 @@ def random_part(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _body(rng: np.random.Generator) -> Manifold:
-    """Return a block, a disc or cone, a plate with a polygonal outline, or an L-shape."""
-    kind = rng.integers(4)
+    """Return a block, a disc or cone, a plate with a polygonal outline, an L-shape or a shaft."""
+    kind = rng.integers(5)
     size = rng.uniform([15, 15, 4], [45, 35, 25])
     if kind == 0:
         return Manifold.cube(size, True)
@@ -76,6 +115,14 @@ def _body(rng: np.random.Generator) -> Manifold:
         outline = radii * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         plate = CrossSection([outline]).extrude(rng.uniform(3, 14))
         return plate if not plate.is_empty() else Manifold.cube(size, True)
+    if kind == 3:
+        shaft, end = Manifold(), 0.0
+        for _ in range(rng.integers(2, 5)):
+            length, radius = rng.uniform(5, 25), rng.uniform(3, 10)
+            sides = rng.choice([6, _SEGMENTS])
+            shaft += Manifold.cylinder(length, radius, radius, sides).translate([0, 0, end - 0.5])
+            end += length - 0.5
+        return shaft
     thickness, height = rng.uniform(2.5, 6), rng.uniform(12, 35)
     flat = Manifold.cube([size[0], size[1], thickness])
     return flat + Manifold.cube([thickness, size[1] * rng.uniform(0.5, 1), height])
@@ -100,22 +147,60 @@ def _feature(rng: np.random.Generator, solid: Manifold, cut: bool) -> Manifold:
 
 
 def write_parts(folder: Path, number: int, seed: int) -> list[Path]:
-    """Write random parts as STL files."""
+    """Write random parts without symmetries as STL files, unless they exist."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"part{index:03}.stl" for index in range(number)]
     for index, file in enumerate(files):
-        random_part(np.random.default_rng([seed, index])).export(file)
+        rng = np.random.default_rng([seed, index])
+        while not file.exists():
+            random_part(rng).export(file)
+            discrete, continuous = find_symmetries(load_part(file, "mm").mesh, 0.02)
+            if len(discrete) or continuous:
+                file.unlink()
     return files
 
 
-def learn(system: PoseSystem, data: PoseDataModule, minutes: float, device: str) -> int:
+def _split(file: Path) -> None:
+    """Divide a part into convex pieces for the simulation of heaps, and cache the pieces."""
+    make_body(load_part(file, "mm"), is_target=True).pieces  # noqa: B018
+
+
+class Replay(Dataset[Sample], Sampler[tuple[int, int, int]]):
+    """Endless training images of the streams, indexed by (stream, number of the view, render).
+
+    A share of each stream's views shows new renders, so the network never waits for the renderer.
+    """
+
+    def __init__(self, streams: Sequence[PoseDataModule], seed: int) -> None:
+        self._streams, self._rng = streams, np.random.default_rng(seed)
+
+    def __getitem__(self, key: tuple[int, int, int]) -> Sample:
+        stream, view, render = key
+        return self._streams[stream].train_item(view, render)
+
+    def __iter__(self) -> Iterator[tuple[int, int, int]]:
+        rendered = [0] * len(STREAMS)
+        for view in itertools.count():
+            number = self._rng.choice(len(STREAMS), p=[stream.share for stream in STREAMS])
+            most = len(self._streams[number].train_source)
+            # Renders of the last batches may be in progress in another worker.
+            if rendered[number] < min(500, most) or (
+                rendered[number] < most and self._rng.random() < STREAMS[number].new_share
+            ):
+                rendered[number] += 1
+                yield number, view, rendered[number] - 1
+            else:
+                yield number, view, int(self._rng.integers(rendered[number]))
+
+
+def learn(system: PoseSystem, loader: Iterable[Batch], minutes: float, device: str) -> int:
     """Train for a given time with a one-cycle schedule; return the number of images."""
     optimizer = system.make_optimizer(system.parameters())
     rates = [group["lr"] for group in optimizer.param_groups]
     system.to(device).train()
     images = 0
     begin = time.perf_counter()
-    for batch in _endless(data):
+    for batch in loader:
         done = (time.perf_counter() - begin) / (60 * minutes)
         if done >= 1:
             break
@@ -132,16 +217,9 @@ def learn(system: PoseSystem, data: PoseDataModule, minutes: float, device: str)
         torch.nn.utils.clip_grad_norm_(system.parameters(), 1.0)
         optimizer.step()
         if images // 50_000 < (images := images + len(batch)) // 50_000:
-            print(f"{images} images: loss {loss.item() * len(system.parts):.3f}", flush=True)
+            seconds, total = time.perf_counter() - begin, loss.item() * len(system.parts)
+            print(f"{images} images, {seconds:.0f} s: loss {total:.3f}", flush=True)
     return images
-
-
-def _endless(data: PoseDataModule) -> Iterator[Batch]:
-    """Yield the batches of all epochs."""
-    loader = data.train_dataloader()
-    for epoch in itertools.count():
-        loader.sampler.set_epoch(epoch)
-        yield from loader
 
 
 def save_start(network: PoseNetwork, path: Path) -> None:
@@ -164,23 +242,50 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the parts")
     parser.add_argument("--from", dest="start", default="null", help="initial weights")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("overrides", nargs="*", help="e.g. data.batch_size=32")
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--workers", type=int, default=available_cores())
+    parser.add_argument("--renders", type=int, default=100_000, help="most renders of a stream")
+    parser.add_argument("--prepare", action="store_true", help="write parts and heaps, then stop")
+    parser.add_argument("overrides", nargs="*", help="e.g. optimizer.lr=0.01")
     args = parser.parse_intermixed_args()
-    files = ",".join(
-        str(file.resolve()) for file in write_parts(args.folder, args.parts, args.seed)
-    )
-    config = config_of(
-        "dopepp_fast", "experiment=my_part", f"data.parts=[{files}]", "data.input_size=[128,128]",
-        f"data.samples_per_epoch={_WINDOWS}", "data.batch_size=160", "optimizer.lr=0.012",
-        # Most maps belong to absent parts; the belief terms of the loss are averages over all maps.
-        f"model.loss.field_weight={2 / args.parts}", f"init_from={args.start}", *args.overrides,
-    )  # fmt: skip
+    files = write_parts(args.folder, args.parts, args.seed)
+    if args.prepare:
+        with ProcessPoolExecutor(args.workers, get_context("fork")) as pool:
+            list(pool.map(_split, files))
+    configs = [
+        config_of(
+            "dopepp_fast", "experiment=my_part", "optimizer.lr=0.012",
+            *stream.overrides, *args.overrides,
+            f"data.parts=[{','.join(str(file.resolve()) for file in files)}]",
+            f"virtual.camera={_CAMERA}", "virtual.working_distance=[0.25,0.5]",
+            "data.symmetries=none", f"data.samples_per_epoch={args.renders}", "data.num_val=1",
+            # Most maps belong to absent parts; belief terms of the loss are averages over all maps.
+            f"model.loss.field_weight={2 / args.parts}", f"init_from={args.start}",
+        )
+        for stream in STREAMS
+    ]  # fmt: skip
+    parts = build_parts(configs[0].data)
+    streams = []
+    configs = [fit_to_camera(config, parts) for config in configs]
+    for config in configs:
+        stream = build_datamodule(config.data, parts, config.seed)
+        backgrounds = training_backgrounds(config.data)
+        stream.train_source = training_renders(config.data, parts, config.seed, backgrounds)
+        stream.train_item(0, 0)  # compiles the rendering code before the workers fork
+        streams.append(stream)
     torch.manual_seed(config.seed)
-    parts = build_parts(config.data)
-    data = build_datamodule(config.data, parts, config.seed)
-    data.train_item(0, 0)  # compiles the rendering code before the workers fork
-    system = build_system(config, parts, "")
-    print(f"{learn(system, data, args.minutes, args.device)} images")
+    replay = Replay(streams, config.seed)
+    options = {"num_workers": args.workers, "multiprocessing_context": "fork"}
+    if args.prepare:
+        starts = range(0, args.renders, _BLOCK)
+        keys = [(1, 0, start + heap) for start in starts for heap in range(_PILES)]
+        list(DataLoader(replay, None, sampler=keys, collate_fn=lambda sample: None, **options))
+        return
+    index = {part.name: number for number, part in enumerate(parts)}
+    merge = partial(collate, object_index=index)
+    loader = DataLoader(replay, args.batch, sampler=replay, collate_fn=merge, **options)
+    system = build_system(configs[0], parts, "")
+    print(f"{learn(system, loader, args.minutes, args.device)} images")
     save_start(system.network, args.folder / "dopepp_fast.safetensors")
 
 

@@ -379,7 +379,7 @@ class PoseEstimator:
                 best = self.refiner(detection, image, K, depth)
                 if detection.alternative is not None and (best.probability or 0.0) < PROBABLE:
                     other = self.refiner(detection.alternative, image, K, depth)
-                    best = max(best, other, key=lambda pose: pose.probability or 0.0)
+                    best = other if (other.probability or 0.0) >= PROBABLE else best
                 refined.append(replace(best, alternative=None))
         return refined
 

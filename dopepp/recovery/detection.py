@@ -46,7 +46,7 @@ REFINED_COVARIANCE_FACTORS: Final = (0.1, 4.0)
 inaccurate meshes, so its covariances are too large on renders."""
 
 PROBABLE: Final = 0.5
-"""Score or probability from which no alternative of a pose is searched or refined."""
+"""Score or probability from which a pose is kept without trying an alternative."""
 
 PASSING: Final = 0.1  # ADD, in diameters, below which a pose is correct
 
@@ -91,7 +91,7 @@ class Detection:
             refinement by region.
         start: Pose and covariance from which refinement started; None without refinement.
         alternative: Further hypothesis of the same instance, found by :mod:`~.search`. Refinement
-            tries it if the first pose is probably wrong, and keeps the more probable pose.
+            tries it if the first pose is probably wrong, and keeps it if it is probably right.
     """
 
     object: str

@@ -280,7 +280,7 @@ def test_region_refines_on_the_image(parts_path):
     assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
 
 
-def test_the_more_probable_hypothesis_is_kept(parts_path, monkeypatch):
+def test_a_probable_alternative_replaces_an_improbable_pose(parts_path, monkeypatch):
     estimator, rendered = oracle_and_render(parts_path, "region", nearer=0.0)
     right = estimator.predict(rendered.image, K_VGA)[0]
     beside = make_transform(TRUE[:3, :3], TRUE[:3, 3] + (0.05, -0.05, 0.0))  # on the wall
