@@ -30,8 +30,10 @@ from dopepp.inference.templates.matching import (
     NUM_SUMMED,
     QUANTUM,
     STRIDE,
+    Matches,
     match,
 )
+from dopepp.inference.templates.ranking import FEATURES, improve_views, move_nearby
 from dopepp.inference.templates.responses import BINS, edge_responses
 from dopepp.inference.templates.views import (
     DRAWN_PX,
@@ -249,6 +251,45 @@ def test_distinct_poses_are_the_first_of_near_duplicates(detector):
     assert distinct_poses(poses, part) == [0, 2, 4, 6]
     assert distinct_poses(poses, part, 2) == [0, 2]
     assert distinct_poses([], part) == []
+
+
+@pytest.mark.parametrize("move", [move_nearby, improve_views])
+def test_moved_matches_have_the_mean_response_at_their_points(detector, move):
+    rng, (height, width), count = np.random.default_rng(6), (90, 120), 60
+    noise = rng.integers(0, 255, (height, width, 3), np.uint8)
+    image = cv2.GaussianBlur(noise, None, 3.0)
+    responses, templates = edge_responses(image, 3, 31), detector._templates
+
+    def mean_response(view, pose):
+        u, v, roll, scale = pose
+        turned = Rotation.from_euler("z", roll).apply(
+            np.pad(templates.points[view], [(0, 0), (0, 1)])
+        )
+        x, y = np.trunc(scale * turned[:, :2] + [u + 0.5, v + 0.5]).astype(int).T
+        plane = np.floor((templates.normals[view] + roll) / np.pi * BINS + 0.5).astype(int) % BINS
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        values = responses[plane, y.clip(0, height - 1), x.clip(0, width - 1)].astype(int)
+        return (values * inside).mean()
+
+    poses = rng.uniform([0, 0, 0, 40], [width, height, 2 * np.pi, 60], (count, 4))
+    ones, chosen = np.ones(count), rng.integers(0, len(templates.points), count)
+    matches = Matches(chosen, poses, 5 * ones, 2 * ones, 3 * ones)
+    options = [4.0] if move is move_nearby else []
+    moved, features = move(matches, templates, responses, image, *options)
+    before, after = (
+        np.array([mean_response(*match) for match in zip(it.views, it.poses, strict=True)])
+        for it in (matches, moved)
+    )
+    found = features[:, FEATURES.index("response")]
+    np.testing.assert_allclose(found, after, atol=1e-9)
+    assert (after > before).mean() > 0.9
+    np.testing.assert_allclose(features[:, FEATURES.index("edges")], (after - 2) / 3)
+    off = np.abs(moved.poses - poses)
+    if move is move_nearby:
+        assert (moved.views == chosen).all()
+        assert off[:, :2].max() < 4.0 + 1.0 * (1 + 0.6 + 0.36) + 1e-9
+    else:
+        assert (moved.views != chosen).mean() > 0.5
 
 
 def test_neighbouring_views_differ_least_after_their_twist():
