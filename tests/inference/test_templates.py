@@ -385,6 +385,35 @@ def test_the_silhouette_of_a_ball_has_the_area_of_its_disc():
     assert TemplateDetector(part, DISTANCES).silhouette(T) == pytest.approx(disc, rel=0.02)
 
 
+def test_half_turns_keep_the_centre_the_tilt_and_the_symmetries(detector, rendered):
+    _, _, T = rendered
+    centre = np.append(
+        (detector._mesh.vertices.min(axis=0) + detector._mesh.vertices.max(axis=0)) / 2, 1
+    )
+    turned = detector.half_turned(T)
+    assert len(turned) == 3
+    for axis, pose in enumerate(turned):
+        np.testing.assert_allclose(pose @ centre, T @ centre)
+        turn = T[:3, :3].T @ pose[:3, :3]
+        np.testing.assert_allclose(
+            turn, 2 * np.outer(*[np.eye(3)[axis]] * 2) - np.eye(3), atol=1e-9
+        )
+    upright = np.diag([1.0, -1.0, -1.0, 1.0])
+    upright[2, 3] = 0.25
+    limited = TemplateDetector(detector.part, DISTANCES, tilt_deg=30)
+    (pose,) = limited.half_turned(upright)
+    np.testing.assert_allclose(pose[:3, :3], np.diag([-1.0, 1.0, -1.0]), atol=1e-9)
+    box = trimesh.creation.box((0.04, 0.03, 0.02))
+    part = make_part("box", Mesh(np.asarray(box.vertices), box.faces.astype(np.int32)))
+    symmetric = replace(
+        part,
+        symmetries_discrete=np.pad(HALF_TURNS[1:], ((0, 0), (0, 1), (0, 1)))
+        + np.diag([0, 0, 0, 1]),
+    )
+    assert len(TemplateDetector(part, DISTANCES, tilt_deg=5).half_turned(upright)) == 1
+    assert TemplateDetector(symmetric, DISTANCES, tilt_deg=5).half_turned(upright) == []
+
+
 def test_a_thin_silhouette_needs_more_evidence(detector, rendered):
     estimator = TemplateEstimator([detector], DISTANCES)
     _, K, T = rendered
