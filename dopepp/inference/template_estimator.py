@@ -159,23 +159,30 @@ class TemplateEstimator(PoseEstimator):
 
         Of each part's start poses, only those with the best scores and those whose outlines fit
         best after the coarse round are refined. Start poses are so inaccurate that a single
-        refinement may stop too early. Tracked poses are refined only once. Under a time limit, all
-        poses are refined once, until the time is spent.
+        refinement may stop too early. Half turns often have nearly the same outline, so the best
+        pose is also refined after half turns. Tracked poses are refined only once. Under a time
+        limit, all poses are refined once, until the time is spent.
         """
-        if self.max_ms is not None or any(start.agreement is not None for start in detections):
+        if any(start.agreement is not None for start in detections):
             return super().refined(detections, image, K, depth)
-        ends: list[Detection] = []
+        if self.max_ms is not None:
+            ends = super().refined(detections, image, K, depth)
+            detectors = {detector.part.name: detector for detector in self.detectors}
+            return [self._verified_again(detectors[end.object], end, image, K) for end in ends]
+        ends = []
         for detector in self.detectors:
             starts = [start for start in detections if start.object == detector.part.name]
             best = self._most_promising(starts, image, K)
             poses = sorted(super().refined(best, image, K, depth), key=_probability, reverse=True)
             chosen = distinct_poses([pose.T_cam_obj for pose in poses], detector.part)
-            ends += [
+            group = [
                 self._refined_again(detector, poses[number], image, K, depth)
                 if rank < NUM_REPEATED
                 else poses[number]
                 for rank, number in enumerate(chosen)
             ]
+            group += self._half_turned(detector, group, image, K, depth)
+            ends += [self._verified_again(detector, end, image, K) for end in group]
         return ends
 
     def _most_promising(
@@ -211,6 +218,43 @@ class TemplateEstimator(PoseEstimator):
                 break
             end = new
         return end
+
+    def _half_turned(
+        self,
+        detector: TemplateDetector,
+        ends: Sequence[Detection],
+        image: RGBImage,
+        K: CameraMatrix,
+        depth: Depth | None,
+    ) -> list[Detection]:
+        """Refine the best pose after half turns, and return the most probable result.
+
+        See :meth:`TemplateDetector.half_turned`.
+        """
+        if not ends:
+            return []
+        best = max(ends, key=partial(_evidence, detector))
+        turned = detector.half_turned(best.T_cam_obj)
+        starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
+        poses = sorted(super().refined(starts, image, K, depth), key=_probability, reverse=True)
+        return [self._refined_again(detector, pose, image, K, depth) for pose in poses[:1]]
+
+    def _verified_again(
+        self, detector: TemplateDetector, end: Detection, image: RGBImage, K: CameraMatrix
+    ) -> Detection:
+        """Return a pose with the mean log odds of its verification and of a second verification.
+
+        The verification depends on the way of refinement to the pose: on its length and on the
+        covariance at its end. The second verification omits the way: the pose counts as a start
+        pose. Otherwise a wrong pose can be more probable than the correct pose, because its last
+        refinement was long.
+        """
+        if end.probability is None or self.refiner is None:
+            return end
+        start = detector.start(end.T_cam_obj, end.score, K)
+        second = _probability(self.refiner.verified(start, image, K))
+        mean = (log_odds(end.probability) + log_odds(second)) / 2
+        return replace(end, probability=1 / (1 + math.exp(-mean)))
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
@@ -264,6 +308,11 @@ def _probability(detection: Detection) -> float:
     return detection.probability or 0.0
 
 
+def _evidence(detector: TemplateDetector, detection: Detection) -> float:
+    """Return the log odds that exceed those a pose with its silhouette must have."""
+    return log_odds(_probability(detection)) - _silhouette_handicap(detector, detection)
+
+
 def _silhouette_handicap(detector: TemplateDetector, detection: Detection) -> float:
     """Return the additional log odds that a pose with a small silhouette must have.
 
@@ -289,8 +338,7 @@ def _largest_log_odds(
     levels = []
     for image in images:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        odds = [log_odds(_probability(end)) - _silhouette_handicap(detector, end) for end in ends]
-        levels.append(max(odds, default=0.0))
+        levels.append(max((_evidence(detector, end) for end in ends), default=0.0))
     return levels
 
 

@@ -30,8 +30,10 @@ from dopepp.inference.templates.matching import (
     NUM_SUMMED,
     QUANTUM,
     STRIDE,
+    Matches,
     match,
 )
+from dopepp.inference.templates.ranking import FEATURES, improve_views, move_nearby
 from dopepp.inference.templates.responses import BINS, edge_responses
 from dopepp.inference.templates.views import (
     DRAWN_PX,
@@ -251,6 +253,45 @@ def test_distinct_poses_are_the_first_of_near_duplicates(detector):
     assert distinct_poses([], part) == []
 
 
+@pytest.mark.parametrize("move", [move_nearby, improve_views])
+def test_moved_matches_have_the_mean_response_at_their_points(detector, move):
+    rng, (height, width), count = np.random.default_rng(6), (90, 120), 60
+    noise = rng.integers(0, 255, (height, width, 3), np.uint8)
+    image = cv2.GaussianBlur(noise, None, 3.0)
+    responses, templates = edge_responses(image, 3, 31), detector._templates
+
+    def mean_response(view, pose):
+        u, v, roll, scale = pose
+        turned = Rotation.from_euler("z", roll).apply(
+            np.pad(templates.points[view], [(0, 0), (0, 1)])
+        )
+        x, y = np.trunc(scale * turned[:, :2] + [u + 0.5, v + 0.5]).astype(int).T
+        plane = np.floor((templates.normals[view] + roll) / np.pi * BINS + 0.5).astype(int) % BINS
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        values = responses[plane, y.clip(0, height - 1), x.clip(0, width - 1)].astype(int)
+        return (values * inside).mean()
+
+    poses = rng.uniform([0, 0, 0, 40], [width, height, 2 * np.pi, 60], (count, 4))
+    ones, chosen = np.ones(count), rng.integers(0, len(templates.points), count)
+    matches = Matches(chosen, poses, 5 * ones, 2 * ones, 3 * ones)
+    options = [4.0] if move is move_nearby else []
+    moved, features = move(matches, templates, responses, image, *options)
+    before, after = (
+        np.array([mean_response(*match) for match in zip(it.views, it.poses, strict=True)])
+        for it in (matches, moved)
+    )
+    found = features[:, FEATURES.index("response")]
+    np.testing.assert_allclose(found, after, atol=1e-9)
+    assert (after > before).mean() > 0.9
+    np.testing.assert_allclose(features[:, FEATURES.index("edges")], (after - 2) / 3)
+    off = np.abs(moved.poses - poses)
+    if move is move_nearby:
+        assert (moved.views == chosen).all()
+        assert off[:, :2].max() < 4.0 + 1.0 * (1 + 0.6 + 0.36) + 1e-9
+    else:
+        assert (moved.views != chosen).mean() > 0.5
+
+
 def test_neighbouring_views_differ_least_after_their_twist():
     rotations = view_rotations(180.0)
     neighbours, twists = _neighbours(rotations)
@@ -342,6 +383,35 @@ def test_the_silhouette_of_a_ball_has_the_area_of_its_disc():
     T[2, 3] = 0.1
     disc = np.pi / 4 / (1 - 0.3**2)  # the sine of half the angle that it covers is 0.3
     assert TemplateDetector(part, DISTANCES).silhouette(T) == pytest.approx(disc, rel=0.02)
+
+
+def test_half_turns_keep_the_centre_the_tilt_and_the_symmetries(detector, rendered):
+    _, _, T = rendered
+    centre = np.append(
+        (detector._mesh.vertices.min(axis=0) + detector._mesh.vertices.max(axis=0)) / 2, 1
+    )
+    turned = detector.half_turned(T)
+    assert len(turned) == 3
+    for axis, pose in enumerate(turned):
+        np.testing.assert_allclose(pose @ centre, T @ centre)
+        turn = T[:3, :3].T @ pose[:3, :3]
+        np.testing.assert_allclose(
+            turn, 2 * np.outer(*[np.eye(3)[axis]] * 2) - np.eye(3), atol=1e-9
+        )
+    upright = np.diag([1.0, -1.0, -1.0, 1.0])
+    upright[2, 3] = 0.25
+    limited = TemplateDetector(detector.part, DISTANCES, tilt_deg=30)
+    (pose,) = limited.half_turned(upright)
+    np.testing.assert_allclose(pose[:3, :3], np.diag([-1.0, 1.0, -1.0]), atol=1e-9)
+    box = trimesh.creation.box((0.04, 0.03, 0.02))
+    part = make_part("box", Mesh(np.asarray(box.vertices), box.faces.astype(np.int32)))
+    symmetric = replace(
+        part,
+        symmetries_discrete=np.pad(HALF_TURNS[1:], ((0, 0), (0, 1), (0, 1)))
+        + np.diag([0, 0, 0, 1]),
+    )
+    assert len(TemplateDetector(part, DISTANCES, tilt_deg=5).half_turned(upright)) == 1
+    assert TemplateDetector(symmetric, DISTANCES, tilt_deg=5).half_turned(upright) == []
 
 
 def test_a_thin_silhouette_needs_more_evidence(detector, rendered):

@@ -29,6 +29,7 @@ from dopepp.geometry.camera import (
     camera_matrix,
     crop_camera,
     focal_length,
+    make_transform,
     project_keypoints,
 )
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -99,10 +100,11 @@ class TemplateDetector:
             raise UserError(
                 f"templates of {part.name}, which has no mesh", "a part with a mesh", fix
             )
-        self.part, self._distances = part, working_distance
+        self.part, self._distances, self._tilt_deg = part, working_distance, tilt_deg
         self._mesh = mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
         self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
+        self._half_turns = _half_turns(self._centre, group)
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
         # Near the camera, the perspective of a part changes strongly with its distance.
         nearness = np.minimum(part.diameter / np.array(working_distance), 1 / NEAREST)
@@ -168,6 +170,20 @@ class TemplateDetector:
             reprojection_error_px=0.0,
             covariance=np.diag(np.square(deviations)),
         )
+
+    def half_turned(self, T_cam_obj: Transform) -> list[Transform]:
+        """Return a pose after half turns of the part about the axes of its cuboid.
+
+        Half turns that are symmetries of the part are omitted, and poses beyond the largest tilt.
+        """
+        turned = [T_cam_obj @ turn for turn in self._half_turns]
+        return [pose for pose in turned if self._tilt(pose) <= math.radians(self._tilt_deg)]
+
+    def _tilt(self, T_cam_obj: Transform) -> float:
+        """Return the angle between the part's z axis and the direction to the camera, radians."""
+        to_camera = -(T_cam_obj[:3, :3] @ self._centre + T_cam_obj[:3, 3])
+        cosine = T_cam_obj[:3, 2] @ to_camera / np.linalg.norm(to_camera)
+        return math.acos(min(max(float(cosine), -1.0), 1.0))
 
     def silhouette(self, T_cam_obj: Transform) -> float:
         """Return the area of the part's silhouette at a pose, squared diameters."""
@@ -321,6 +337,19 @@ def distinct_poses(
             | (trace < 1 + 2 * math.cos(SAME_TURN))
         )
     return chosen
+
+
+def _half_turns(
+    centre: Float[np.ndarray, "3"], group: Float[np.ndarray, "symmetries 4 4"]
+) -> list[Transform]:
+    """Return half turns about the axes through a point, except those near an element of a group."""
+    turns = []
+    for axis in np.eye(3):
+        R = 2 * np.outer(axis, axis) - np.eye(3)
+        traces = np.einsum("nij,ij->n", group[:, :3, :3], R)
+        if traces.max() < 1 + 2 * math.cos(SAME_TURN):
+            turns.append(make_transform(R, centre - R @ centre))
+    return turns
 
 
 def _resized(image: RGBImage, scale: float) -> RGBImage:

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import RGBImage
 from dopepp.inference.templates.matching import Matches
-from dopepp.inference.templates.responses import Responses
+from dopepp.inference.templates.responses import BINS, Responses
 from dopepp.inference.templates.views import Templates
 
 FEATURES: Final = (
@@ -133,41 +133,91 @@ def _features(
 
 
 @compiled(fastmath=True)
+def _place(
+    points: Array, normals: Array, roll: float, scale: float, offsets: Array, bins: Array
+) -> None:
+    """Rotate and scale a template: write the offsets of its points and their orientations.
+
+    ``offsets`` (2, points) are relative to the template's centre, pixels.
+    """
+    c, s = scale * math.cos(roll), scale * math.sin(roll)
+    for p in range(len(bins)):
+        offsets[0, p] = c * points[p, 0] - s * points[p, 1]
+        offsets[1, p] = s * points[p, 0] + c * points[p, 1]
+        # Angles are above −4π, and the remainder must not be negative.
+        bins[p] = int((normals[p] + roll) * BINS / math.pi + 8 * BINS + 0.5) % BINS
+
+
+@compiled(fastmath=True)
 def _response(
-    maps: Array, points: Array, normals: Array, u: float, v: float, roll: float, scale: float
+    maps: Array, offsets: Array, bins: Array, u: float, v: float, indices: Array
 ) -> float:
-    """Return the mean edge response at the points of a template with its centre at pixel (u, v)."""
-    bins, height, width = maps.shape
-    c, s, total = scale * math.cos(roll), scale * math.sin(roll), 0
-    for p in range(len(points)):
-        x = int(u + c * points[p, 0] - s * points[p, 1] + 0.5)
-        y = int(v + s * points[p, 0] + c * points[p, 1] + 0.5)
-        if 0 <= x < width and 0 <= y < height:
-            # Angles are above −4π, and the remainder must not be negative.
-            total += maps[int((normals[p] + roll) * bins / math.pi + 8 * bins + 0.5) % bins, y, x]
-    return total / len(points)
+    """Return the mean edge response at the points of a template with its centre at pixel (u, v).
+
+    ``indices`` is overwritten. The compiler vectorises their loop because it is separate. They are
+    32-bit integers: maps have less than 2³¹ elements.
+    """
+    height, width, total = np.int32(maps.shape[1]), np.int32(maps.shape[2]), 0
+    flat = maps.reshape(-1)
+    for p in range(len(bins)):
+        x, y = np.int32(u + offsets[0, p] + 0.5), np.int32(v + offsets[1, p] + 0.5)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        indices[p] = (bins[p] * height + y) * width + x if inside else np.int32(-1)
+    for p in range(len(bins)):
+        if indices[p] >= 0:
+            total += flat[indices[p]]
+    return total / len(bins)
+
+
+@compiled()
+def _workspace(count: int) -> tuple[Array, Array, Array]:
+    """Return arrays for two placements of a template with ``count`` points.
+
+    Returns:
+        ``offsets`` and ``bins`` of :func:`_place` for both, and ``indices`` of :func:`_response`.
+    """
+    return np.empty((2, 2, count)), np.empty((2, count), np.int32), np.empty(count, np.int32)
 
 
 @compiled(fastmath=True)
 def _climb(
-    maps: Array, points: Array, normals: Array, pose: Array, reach: float, rounds: int
+    maps: Array,
+    points: Array,
+    normals: Array,
+    pose: Array,
+    reach: float,
+    rounds: int,
+    workspace: tuple[Array, Array, Array],
 ) -> float:
     """Maximise the response over the four numbers of a pose, changing one number at a time.
 
-    ``reach`` (pixels) is the first step of the position. Each round has smaller steps.
+    Args:
+        maps: Responses.
+        points: Points of the template.
+        normals: Direction of each point's normal.
+        pose: Pose, updated in place.
+        reach: First step of the position, pixels.
+        rounds: Number of rounds; each has smaller steps.
+        workspace: Result of :func:`_workspace`.
 
     Returns:
-        The highest response; ``pose`` is updated in place.
+        The highest response.
     """
-    most = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
+    used, (offsets, bins, indices) = 0, workspace
+    _place(points, normals, pose[2], pose[3], offsets[used], bins[used])
+    most = _response(maps, offsets[used], bins[used], pose[0], pose[1], indices)
     steps = np.array([reach, reach, ROLL_STEP / 2, GROWTH * pose[3]])
     for _ in range(rounds):
         for axis in range(4):
             for sign in (-1.0, 1.0):
                 pose[axis] += sign * steps[axis]
-                value = _response(maps, points, normals, pose[0], pose[1], pose[2], pose[3])
+                trial = used
+                if axis >= 2:  # the offsets depend on rotation and size only
+                    trial = 1 - used
+                    _place(points, normals, pose[2], pose[3], offsets[trial], bins[trial])
+                value = _response(maps, offsets[trial], bins[trial], pose[0], pose[1], indices)
                 if value > most:
-                    most = value
+                    most, used = value, trial
                 else:
                     pose[axis] -= sign * steps[axis]
         steps *= 0.6
@@ -189,20 +239,33 @@ def _search(
     ``reach`` is half the side of the grid, pixels. ``poses`` is updated in place, and ``best`` is
     filled with the response of each match.
     """
+    height, width = maps.shape[1], maps.shape[2]
+    workspace = _workspace(points.shape[1])
+    offsets, bins = workspace[0][0], workspace[1][0]
+    columns, rows, sums = np.empty(5, np.int64), np.empty(5, np.int64), np.empty((5, 5), np.int64)
     for i in range(len(views)):
         edges, angles, scale = points[views[i]], normals[views[i]], poses[i, 3]
-        few, directions = edges[:FEW], angles[:FEW]
-        u, v, roll, most = poses[i, 0], poses[i, 1], poses[i, 2], -1e9
-        at_u, at_v, at_roll = u, v, roll
+        u, v, roll, most = poses[i, 0], poses[i, 1], poses[i, 2], -FEW * 128 - 1
         for k in range(-1, 2):
-            for across in range(-2, 3):
-                for down in range(-2, 3):
-                    x, y, angle = u + across * reach / 2, v + down * reach / 2, roll + k * ROLL_STEP
-                    value = _response(maps, few, directions, x, y, angle, scale)
-                    if value > most:
-                        most, at_u, at_v, at_roll = value, x, y, angle
-        poses[i, 0], poses[i, 1], poses[i, 2] = at_u, at_v, at_roll
-        best[i] = _climb(maps, edges, angles, poses[i], reach / 4, 3)
+            angle = roll + k * ROLL_STEP
+            _place(edges, angles, angle, scale, offsets, bins[:FEW])
+            sums[:] = 0
+            for p in range(FEW):
+                for n in range(5):
+                    shift = (n - 2) * reach / 2
+                    columns[n] = int(u + shift + offsets[0, p] + 0.5)
+                    rows[n] = int(v + shift + offsets[1, p] + 0.5)
+                for n in range(5):
+                    for m in range(5):
+                        x, y = columns[n], rows[m]
+                        if 0 <= x < width and 0 <= y < height:
+                            sums[n, m] += maps[bins[p], y, x]
+            for n in range(5):
+                for m in range(5):
+                    if sums[n, m] > most:
+                        most, poses[i, 2] = sums[n, m], angle
+                        poses[i, 0], poses[i, 1] = u + (n - 2) * reach / 2, v + (m - 2) * reach / 2
+        best[i] = _climb(maps, edges, angles, poses[i], reach / 4, 3, workspace)
 
 
 @compiled(fastmath=True)
@@ -222,9 +285,10 @@ def _improve_views(
     each match.
     """
     pose, best = np.empty(4), np.empty(4)
+    workspace = _workspace(points.shape[1])
     for i in range(len(views)):
         best[:] = poses[i]
-        most = _climb(maps, points[views[i]], normals[views[i]], best, REACH_PX, 2)
+        most = _climb(maps, points[views[i]], normals[views[i]], best, REACH_PX, 2, workspace)
         for _ in range(MAX_CHANGES):
             view, chosen = views[i], views[i]
             poses[i] = best
@@ -232,7 +296,7 @@ def _improve_views(
                 other = neighbours[view, k]
                 pose[:] = poses[i]
                 pose[2] += twists[view, k]
-                value = _climb(maps, points[other], normals[other], pose, REACH_PX, 2)
+                value = _climb(maps, points[other], normals[other], pose, REACH_PX, 2, workspace)
                 if value > most:
                     most, chosen = value, other
                     best[:] = pose
@@ -255,7 +319,7 @@ def _describe(
     features: Array,
 ) -> None:
     """Write to ``features`` each match's image features, except the mean response."""
-    bins, height, width = maps.shape
+    height, width = maps.shape[1], maps.shape[2]
     mean, colours = np.zeros(3), np.zeros((inner.shape[1], 3))
     for i in range(len(views)):
         view, u, v, roll, scale = views[i], poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3]
@@ -268,7 +332,7 @@ def _describe(
             if not (0 <= x < width and 0 <= y < height):
                 continue
             strongest = maps[0, y, x]
-            for b in range(1, bins):
+            for b in range(1, BINS):
                 strongest = max(strongest, maps[b, y, x])
             texture += strongest
             for k in range(3):
@@ -290,7 +354,7 @@ def _describe(
             if not (0 <= x < width and 0 <= y < height):
                 continue
             angle = normals[view, p] + roll
-            b = int(angle * bins / math.pi + 8 * bins + 0.5) % bins
+            b = int(angle * BINS / math.pi + 8 * BINS + 0.5) % BINS
             supported += maps[b, int(y), int(x)] > SUPPORT
             shown += 1
             if not is_outline[view, p]:
