@@ -1,6 +1,7 @@
 """Learn the initial weights of ``init_from=auto`` from random parts in a given time, on a GPU.
 
-    python benchmarks/learn_start.py data/start --minutes 6 [--parts 160] [--from auto]
+    python benchmarks/learn_start.py data/start --parts 96 --prepare data.cache=none
+    python benchmarks/learn_start.py data/start --parts 96 --minutes 8.5 [--from auto]
 
 Random parts are bodies with bosses, ribs, holes and slots, similar to machined or printed parts. A
 single network learns the poses of all parts: single parts with any in-plane rotation and tilts of
@@ -8,7 +9,7 @@ up to 60°, and heaps (extra ``robot``). The weights of all layers except the ou
 are specific to the parts, are written to ``dopepp_fast.safetensors`` in the folder, which also
 holds the parts' meshes.
 
-``--prepare`` only writes the meshes and the cached heaps, which takes about 20 s per part.
+``--prepare`` only writes the meshes and the cached heaps: about 20 s per part on one core.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_ca
 from dopepp.experiment.assembly.build_system import build_system
 from dopepp.experiment.assembly.photos import training_backgrounds
 from dopepp.experiment.assembly.renders import training_renders
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.models.network import PoseNetwork
 from dopepp.models.start import output_tensors
 from dopepp.models.storage import write_safetensors
@@ -233,12 +235,25 @@ def save_start(network: PoseNetwork, path: Path) -> None:
     write_safetensors(path, weights, {})
 
 
+def stream_config(stream: Stream, files: Sequence[Path], args: argparse.Namespace) -> RunConfig:
+    """Return the config of a stream for part files and the command's arguments."""
+    return config_of(
+        "dopepp_fast", "experiment=my_part", "optimizer.lr=0.012",
+        *stream.overrides, *args.overrides,
+        f"data.parts=[{','.join(str(file.resolve()) for file in files)}]",
+        f"virtual.camera={_CAMERA}", "virtual.working_distance=[0.25,0.5]",
+        "data.symmetries=none", f"data.samples_per_epoch={args.renders}", "data.num_val=1",
+        # Most maps belong to absent parts; belief terms of the loss are averages over all maps.
+        f"model.loss.field_weight={2 / args.parts}", f"init_from={args.start}",
+    )  # fmt: skip
+
+
 def main() -> None:
     """Learn the weights and write them."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--minutes", type=float, default=6.0)
-    parser.add_argument("--parts", type=int, default=160)
+    parser.add_argument("--parts", type=int, default=96)
     parser.add_argument("--seed", type=int, default=0, help="seed of the parts")
     parser.add_argument("--from", dest="start", default="null", help="initial weights")
     parser.add_argument("--device", default="cuda")
@@ -252,29 +267,19 @@ def main() -> None:
     if args.prepare:
         with ProcessPoolExecutor(args.workers, get_context("fork")) as pool:
             list(pool.map(_split, files))
-    configs = [
-        config_of(
-            "dopepp_fast", "experiment=my_part", "optimizer.lr=0.012",
-            *stream.overrides, *args.overrides,
-            f"data.parts=[{','.join(str(file.resolve()) for file in files)}]",
-            f"virtual.camera={_CAMERA}", "virtual.working_distance=[0.25,0.5]",
-            "data.symmetries=none", f"data.samples_per_epoch={args.renders}", "data.num_val=1",
-            # Most maps belong to absent parts; belief terms of the loss are averages over all maps.
-            f"model.loss.field_weight={2 / args.parts}", f"init_from={args.start}",
-        )
-        for stream in STREAMS
-    ]  # fmt: skip
+    configs = [stream_config(stream, files, args) for stream in STREAMS]
     parts = build_parts(configs[0].data)
-    streams = []
     configs = [fit_to_camera(config, parts) for config in configs]
+    streams, seed = [], configs[0].seed
     for config in configs:
-        stream = build_datamodule(config.data, parts, config.seed)
+        stream = build_datamodule(config.data, parts, seed)
+        # Each render is requested by its index, so this source is not shuffled.
         backgrounds = training_backgrounds(config.data)
-        stream.train_source = training_renders(config.data, parts, config.seed, backgrounds)
+        stream.train_source = training_renders(config.data, parts, seed, backgrounds)
         stream.train_item(0, 0)  # compiles the rendering code before the workers fork
         streams.append(stream)
-    torch.manual_seed(config.seed)
-    replay = Replay(streams, config.seed)
+    torch.manual_seed(seed)
+    replay = Replay(streams, seed)
     options = {"num_workers": args.workers, "multiprocessing_context": "fork"}
     if args.prepare:
         starts = range(0, args.renders, _BLOCK)

@@ -1,6 +1,6 @@
 """Initial weights from a trained network, or from the package's network of random parts.
 
-The package's weights come from networks that learned the poses of 288 random parts
+The package's weights come from networks that learned the poses of 384 random parts
 (``benchmarks/learn_start.py``). A new part needs half the images from there (docs/lab/start.md).
 """
 
