@@ -25,7 +25,7 @@ from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, make_detection
-from dopepp.recovery.search import Depths, search_instance
+from dopepp.recovery.search import CLEAR, Depths, search_instance
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -87,9 +87,9 @@ def recover(
         K: Camera matrix of the network's input, pixels.
         stride: Pixels of the network's input per cell.
         names: Names of the objects (default: their indices).
-        depths: Nearest and farthest depth of each object, metres. Poses of instances whose score is
-            below :data:`PROBABLE` are also searched in this range (:mod:`~.search`), as
-            ``Detection.alternative``. None (the default): no search.
+        depths: Nearest and farthest depth of each object, metres. Poses of instances with a clear
+            centroid whose score is below :data:`PROBABLE` are also searched in this range
+            (:mod:`~.search`), as ``Detection.alternative``. None (the default): no search.
         **options: Fields of :class:`RecoveryOptions`.
 
     Returns:
@@ -146,7 +146,8 @@ def recover_batch(
             for group, result in instances:
                 detection = make_detection(group, result, cuboid, camera, name, chosen)
                 is_probable = detection is not None and detection.score >= PROBABLE
-                if reach is not None and maps is not None and not is_probable:
+                is_clear = group.score[CENTROID] >= CLEAR
+                if reach is not None and maps is not None and is_clear and not is_probable:
                     place = cuboid, camera, stride, reach, name, chosen
                     other = search_instance(maps, own_peaks, group, *place)
                     if detection is None or detection.score < chosen.min_score:

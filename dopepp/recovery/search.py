@@ -32,6 +32,7 @@ from dopepp.recovery.detection import Detection, RecoveryOptions, calibrate
 Beliefs = Float[np.ndarray, "9 height width"]
 Depths = tuple[float, float]  # nearest and farthest depth, metres
 
+CLEAR: Final = 0.3  # belief of a centroid's peak from which a pose is searched
 ROTATION_DEVIATION: Final = 0.3  # standard deviation of a searched rotation, radians
 DEPTH_DEVIATION: Final = 0.08  # standard deviation of a searched depth, relative
 CENTROID_DEVIATION: Final = 0.4  # standard deviation of a centroid's peak, cells

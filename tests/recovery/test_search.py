@@ -12,6 +12,7 @@ from dopepp.recovery import recover
 from dopepp.recovery.detection import PROBABLE
 from dopepp.recovery.search import (
     CENTROID_DEVIATION,
+    CLEAR,
     DEPTH_DEVIATION,
     ROTATION_DEVIATION,
     search_covariance,
@@ -95,6 +96,14 @@ def test_only_uncertain_instances_have_an_alternative(scene):
     assert measured[5:].all()
     errors = (found.peaks - found.keypoints)[measured]
     assert found.reprojection_error_px == pytest.approx(np.sqrt((errors**2).sum(1).mean()))
+
+
+def test_no_pose_is_searched_at_a_weak_centroid(scene):
+    scene, belief, field = scene
+    belief[:5, :, 26:] = 0.0
+    belief[8] *= CLEAR - 0.02
+    weak = recover(belief, field, scene.cuboids, scene.K, depths=[DEPTHS], min_score=0.0)
+    assert [found.alternative for found in weak] == [None, None]
 
 
 def test_an_instance_without_a_pose_gets_the_searched_pose(scene):
