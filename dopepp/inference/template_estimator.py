@@ -163,13 +163,9 @@ class TemplateEstimator(PoseEstimator):
         pose is also refined after half turns. Tracked poses are refined only once. Under a time
         limit, all poses are refined once, until the time is spent.
         """
-        if any(start.agreement is not None for start in detections):
+        if self.max_ms is not None or any(start.agreement is not None for start in detections):
             return super().refined(detections, image, K, depth)
-        if self.max_ms is not None:
-            ends = super().refined(detections, image, K, depth)
-            detectors = {detector.part.name: detector for detector in self.detectors}
-            return [self._verified_again(detectors[end.object], end, image, K) for end in ends]
-        ends = []
+        ends: list[Detection] = []
         for detector in self.detectors:
             starts = [start for start in detections if start.object == detector.part.name]
             best = self._most_promising(starts, image, K)
@@ -181,8 +177,7 @@ class TemplateEstimator(PoseEstimator):
                 else poses[number]
                 for rank, number in enumerate(chosen)
             ]
-            group += self._half_turned(detector, group, image, K, depth)
-            ends += [self._verified_again(detector, end, image, K) for end in group]
+            ends += group + self._half_turned(detector, group, image, K, depth)
         return ends
 
     def _most_promising(
@@ -238,23 +233,6 @@ class TemplateEstimator(PoseEstimator):
         starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
         poses = sorted(super().refined(starts, image, K, depth), key=_probability, reverse=True)
         return [self._refined_again(detector, pose, image, K, depth) for pose in poses[:1]]
-
-    def _verified_again(
-        self, detector: TemplateDetector, end: Detection, image: RGBImage, K: CameraMatrix
-    ) -> Detection:
-        """Return a pose with the mean log odds of its verification and of a second verification.
-
-        The verification depends on the way of refinement to the pose: on its length and on the
-        covariance at its end. The second verification omits the way: the pose counts as a start
-        pose. Otherwise a wrong pose can be more probable than the correct pose, because its last
-        refinement was long.
-        """
-        if end.probability is None or self.refiner is None:
-            return end
-        start = detector.start(end.T_cam_obj, end.score, K)
-        second = _probability(self.refiner.verified(start, image, K))
-        mean = (log_odds(end.probability) + log_odds(second)) / 2
-        return replace(end, probability=1 / (1 + math.exp(-mean)))
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""

@@ -14,7 +14,6 @@ from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.template_estimator import NUM_REFINED
 from dopepp.inference.tracker import PoseTracker
 from dopepp.parts.catalogue import pivconnector
-from dopepp.recovery.detection import log_odds
 from dopepp.recovery.recover import format_reasons
 from dopepp.virtual import PRESETS, Factory
 
@@ -84,32 +83,6 @@ def test_the_best_pose_is_refined_after_half_turns(near_truth, estimator, render
     best, *_ = estimator.candidates(image, K)
     assert np.degrees(rotation_angle(best.T_cam_obj[:3, :3].T @ truth[:3, :3])) < 1
     assert best.score > wrong.score
-
-
-@pytest.mark.parametrize("max_ms", [None, 60_000.0])
-def test_the_probability_is_the_mean_of_two_verifications(near_truth, rendered, max_ms):
-    image, K, truth = rendered.image, rendered.scene.K, true_pose(rendered)
-    options = {"working_distance": (NEAR, FAR), "max_ms": max_ms}
-    estimator = PoseEstimator.from_mesh("pivconnector", **options)
-    (detector,) = estimator.detectors
-    verified, calls = estimator.refiner.verified, []
-
-    def recorded(detection, *arguments):
-        calls.append((detection, verified(detection, *arguments)))
-        return calls[-1][1]
-
-    estimator.refiner.verified = recorded
-    (end,) = estimator.refined([detector.start(truth, 0.8, K)], image, K)
-    (_, refined), *_, (start, second) = calls
-    np.testing.assert_array_equal(start.T_cam_obj, end.T_cam_obj)
-    np.testing.assert_array_equal(start.covariance, detector.start(truth, 0.8, K).covariance)
-    odds = [log_odds(it.probability) for it in (refined, second)]
-    if max_ms is not None:
-        assert len(calls) == 2
-    assert log_odds(end.probability) >= np.mean(odds) - 1e-9
-    assert log_odds(end.probability) == pytest.approx(
-        np.mean([max(log_odds(it.probability) for _, it in calls[:-1]), odds[1]])
-    )
 
 
 def test_the_given_distances_replace_the_working_distance(estimator, rendered):
