@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -23,6 +24,8 @@ from dopepp.robot.grasping.grasp_trial import Attempt, GraspTask, Record, Trials
 from dopepp.robot.grasping.rehearsal import MOUNT, TRUE_K
 from dopepp.robot.grasping.workbench import has_gl, open_gl
 
+_log = logging.getLogger(__name__)
+
 VIDEO_SIZE: Final = (640, 480)
 STRIDE: Final = 2  # recorded states per frame of a video
 STRIP: Final = (0.0, 0.3, 0.42, 0.53, 0.72, 1.0)
@@ -34,8 +37,9 @@ def show(
 ) -> None:
     """Repeat trials with the task's first pose source, and write images and films of them.
 
-    ``folder`` receives a strip of images of the first trial with each kind of failure; ``video``
-    (.jpg: a strip) and ``rerun`` are films of the first trial.
+    ``folder`` receives a strip of images of the first trial with each kind of failure; a warning
+    states a failure that did not happen again. ``video`` (.jpg: a strip) and ``rerun`` are films of
+    the first trial.
     """
     first = task.sources[0]
     failed = [record for record in records if record.failure and record.source == first.name]
@@ -45,7 +49,11 @@ def show(
     trials = Trials(task)
     for failure, record in examples.items():
         attempts = trials.attempts(trials.scene(record.number), first)
-        attempt = next(islice(attempts, record.attempt - 1, None))
+        attempt = next(islice(attempts, record.attempt - 1, None), None)
+        if attempt is None:  # a trial is not exactly repeatable in another process
+            place = f"attempt {record.attempt} of trial {record.number}"
+            _log.warning("no image of %r: %s did not happen again", failure, place)
+            continue
         write_image(folder / f"{failure.replace(' ', '_')}.jpg", strip(trials, attempt))
     if video is not None or rerun is not None:
         attempt = trials.attempt(trials.scene(0), first)
