@@ -56,6 +56,18 @@ def move_pose(T_cam_obj: Transform, step: Step) -> Transform:
     return make_transform(R @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
 
 
+def rotation_lever(offset: Vector) -> Float[np.ndarray, "6 6"]:
+    """Return the matrix from a rotation about a point, with a shift, to the step of a pose.
+
+    Args:
+        offset: Object's origin relative to the point, camera axes, metres.
+    """
+    x, y, z = offset
+    lever = np.eye(6)
+    lever[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    return lever
+
+
 def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
     """Return T_new_cam, from a camera's frame to its frame after an orbit around a point.
 

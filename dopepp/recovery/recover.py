@@ -25,7 +25,7 @@ from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, make_detection
-from dopepp.recovery.search import CLEAR, Depths, search_instance
+from dopepp.recovery.search import CLEAR, Depths, PoseSearch
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -142,14 +142,17 @@ def recover_batch(
             instances = solve_instances(own_peaks, cuboid, camera, max_angle, float(stride))
             beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
             reach = None if depths is None else depths[c]
-            maps = None if reach is None else beliefs.float().cpu().numpy()
+            search: PoseSearch | None = None  # made for the first uncertain instance
             for group, result in instances:
                 detection = make_detection(group, result, cuboid, camera, name, chosen)
                 is_probable = detection is not None and detection.score >= PROBABLE
                 is_clear = group.score[CENTROID] >= CLEAR
-                if reach is not None and maps is not None and is_clear and not is_probable:
-                    place = cuboid, camera, stride, reach, name, chosen
-                    other = search_instance(maps, own_peaks, group, *place)
+                if reach is not None and is_clear and not is_probable:
+                    if search is None:
+                        maps = beliefs.float().cpu().numpy()
+                        search = PoseSearch(maps, cuboid, camera, stride, reach)
+                    solved = search.solve(group, own_peaks)
+                    other = make_detection(*solved, cuboid, camera, name, chosen)
                     if detection is None or detection.score < chosen.min_score:
                         detection = other
                     else:

@@ -23,11 +23,12 @@ from dopepp.geometry.camera import (
     focal_length,
     make_transform,
     project_keypoints,
+    rotation_lever,
 )
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.geometry.pnp import PnPResult
 from dopepp.geometry.rotation import Vector
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks
-from dopepp.recovery.detection import Detection, RecoveryOptions, calibrate
 
 Beliefs = Float[np.ndarray, "9 height width"]
 Depths = tuple[float, float]  # nearest and farthest depth, metres
@@ -42,83 +43,68 @@ _STEP: Final = 0.17  # largest difference between logarithms of tried depths
 _FLOOR: Final = 0.02  # belief added before the logarithm, for corners without belief
 
 
-def search_instance(
-    belief: Beliefs,
-    peaks: ObjectPeaks,
-    group: KeypointGroup,
-    cuboid: Cuboid,
-    K: CameraMatrix,
-    stride: int,
-    depths: Depths,
-    name: str,
-    options: RecoveryOptions,
-) -> Detection:
-    """Return the calibrated detection of an instance with the pose of :func:`search_pose`.
-
-    Its keypoints are the nearest peaks within a cell of the projected keypoints.
-
-    Args:
-        belief: See :func:`search_pose`.
-        peaks: All peaks of the object.
-        group: Keypoints of the instance, of which only the centroid is used.
-        cuboid: See :func:`search_pose`.
-        K: See :func:`search_pose`.
-        stride: See :func:`search_pose`.
-        depths: See :func:`search_pose`.
-        name: Name of the part.
-        options: Options with the factors of distance and covariance and the score's weights.
-    """
-    T = search_pose(belief, group.position[CENTROID], cuboid, K, stride, depths)
-    projected = project_keypoints(cuboid, T, K)
-    distances = np.linalg.norm(peaks.position - projected[:NUM_CORNERS, None], axis=2)
-    distances[np.isnan(distances)] = math.inf
-    points, scores = np.full((NUM_KEYPOINTS, 2), np.nan), np.zeros(NUM_KEYPOINTS)
-    points[CENTROID], scores[CENTROID] = group.position[CENTROID], group.score[CENTROID]
-    for corner, nearest in enumerate(distances.argmin(axis=1)):
-        if distances[corner, nearest] < stride:
-            points[corner] = peaks.position[corner, nearest]
-            scores[corner] = peaks.score[corner, nearest]
-    mean = float(scores.clip(0.0, 1.0).mean())
-    detection = Detection(
-        object=name,
-        score=mean,
-        belief=mean,
-        T_cam_obj=T,
-        keypoints=projected,
-        peaks=points,
-        reprojection_error_px=math.sqrt(np.nanmean(((points - projected) ** 2).sum(axis=1))),
-        covariance=search_covariance(T, cuboid, focal_length(K), stride),
-    )
-    return calibrate(detection, cuboid, K, options)
-
-
-def search_pose(
-    belief: Beliefs,
-    centroid: Float[np.ndarray, "2"],
-    cuboid: Cuboid,
-    K: CameraMatrix,
-    stride: int,
-    depths: Depths,
-) -> Transform:
-    """Return T_cam_obj with the highest sum of log beliefs at the corners, for a given centroid.
+class PoseSearch:
+    """Searches the poses of an object's instances in its belief maps.
 
     Args:
         belief: Belief maps of the object.
-        centroid: (x, y) of the centroid's peak, input pixels.
         cuboid: Keypoints of the part, object frame, metres.
         K: Camera matrix of the network's input, pixels.
         stride: Input pixels per cell of the maps.
-        depths: Range of the searched depths of the centroid, metres.
+        depths: Range of the searched depths of a centroid, metres.
     """
-    near, far = depths
-    tried = np.geomspace(near, far, math.ceil(math.log(far / near) / _STEP) + 1)
-    gains = np.log1p(np.maximum(belief[:NUM_CORNERS], 0.0) / _FLOOR)  # 0 without belief
-    rotations = _rotations()
-    arms = (cuboid[:NUM_CORNERS] - cuboid[CENTROID]) @ rotations.transpose(0, 2, 1)
-    ray = np.linalg.solve(K, np.array([*centroid, 1.0]))
-    number, rank = _search(np.asarray(gains, np.float32), arms, ray, tried, K, float(stride))
-    rotation = rotations[number]
-    return make_transform(rotation, tried[rank] * ray - rotation @ cuboid[CENTROID])
+
+    def __init__(
+        self, belief: Beliefs, cuboid: Cuboid, K: CameraMatrix, stride: int, depths: Depths
+    ) -> None:
+        self._cuboid, self._K, self._stride = cuboid, K, stride
+        near, far = depths
+        self._depths = np.geomspace(near, far, math.ceil(math.log(far / near) / _STEP) + 1)
+        gains = np.log1p(np.maximum(belief[:NUM_CORNERS], 0.0) / _FLOOR)  # 0 without belief
+        self._gains = np.asarray(gains, np.float32)
+        self._arms = (cuboid[:NUM_CORNERS] - cuboid[CENTROID]) @ _rotations().transpose(0, 2, 1)
+
+    def pose(self, centroid: Float[np.ndarray, "2"]) -> Transform:
+        """Return T_cam_obj with the highest sum of log beliefs at the corners.
+
+        ``centroid`` is (x, y) of the centroid's peak, input pixels.
+        """
+        ray = np.linalg.solve(self._K, np.array([*centroid, 1.0]))
+        number, rank = _search(
+            self._gains, self._arms, ray, self._depths, self._K, float(self._stride)
+        )
+        rotation = _rotations()[number]
+        centre = self._depths[rank] * ray
+        return make_transform(rotation, centre - rotation @ self._cuboid[CENTROID])
+
+    def solve(self, group: KeypointGroup, peaks: ObjectPeaks) -> tuple[KeypointGroup, PnPResult]:
+        """Return an instance's searched pose in place of PnP's, with the keypoints that agree.
+
+        These are the nearest peaks within a cell of the projected keypoints.
+
+        Args:
+            group: Keypoints of the instance, of which only the centroid is used.
+            peaks: All peaks of the object.
+        """
+        T_cam_obj = self.pose(group.position[CENTROID])
+        projected = project_keypoints(self._cuboid, T_cam_obj, self._K)
+        distances = np.linalg.norm(peaks.position - projected[:NUM_CORNERS, None], axis=2)
+        distances[np.isnan(distances)] = math.inf
+        points, scores = np.full((NUM_KEYPOINTS, 2), np.nan), np.zeros(NUM_KEYPOINTS)
+        points[CENTROID], scores[CENTROID] = group.position[CENTROID], group.score[CENTROID]
+        for corner, nearest in enumerate(distances.argmin(axis=1)):
+            if distances[corner, nearest] < self._stride:
+                points[corner] = peaks.position[corner, nearest]
+                scores[corner] = peaks.score[corner, nearest]
+        result = PnPResult(
+            T_cam_obj,
+            math.sqrt(np.nanmean(((points - projected) ** 2).sum(axis=1))),
+            np.isfinite(points[:, 0]),
+            covariance=search_covariance(
+                T_cam_obj, self._cuboid, focal_length(self._K), self._stride
+            ),
+        )
+        return KeypointGroup(points, scores, group.covariance_px), result
 
 
 def search_covariance(T_cam_obj: Transform, cuboid: Cuboid, focal_px: float, stride: int) -> Array:
@@ -130,11 +116,8 @@ def search_covariance(T_cam_obj: Transform, cuboid: Cuboid, focal_px: float, str
     covariance[:3, :3] = ROTATION_DEVIATION**2 * np.eye(3)
     covariance[3:, 3:] = (CENTROID_DEVIATION * stride * depth / focal_px) ** 2 * np.eye(3)
     covariance[3:, 3:] += (DEPTH_DEVIATION * depth) ** 2 * np.outer(along, along)
-    # The centroid is certain, so the origin moves with the rotation about the centroid.
-    lever = np.array([[0, -arm[2], arm[1]], [arm[2], 0, -arm[0]], [-arm[1], arm[0], 0]])
-    moves = np.eye(6)
-    moves[3:, :3] = lever
-    return np.asarray(moves @ covariance @ moves.T)
+    lever = rotation_lever(-arm)  # the part rotates about its centroid, which is certain
+    return np.asarray(lever @ covariance @ lever.T)
 
 
 @cache

@@ -15,8 +15,8 @@ from dopepp.recovery.search import (
     CLEAR,
     DEPTH_DEVIATION,
     ROTATION_DEVIATION,
+    PoseSearch,
     search_covariance,
-    search_pose,
 )
 
 DEPTHS = (0.45, 0.7)
@@ -36,7 +36,7 @@ def test_the_pose_is_found_without_peaks(make_scene, box, pose, K, hidden):
         own, other = (make_scene(box).place(0, place).maps()[0].numpy() for place in (T, beside))
         own[rng.permutation(8)[:hidden]] = 0.0
         centroid = project_keypoints(box, T, K)[8]
-        found = search_pose(np.maximum(own, other), centroid, box, K, 8, DEPTHS)
+        found = PoseSearch(np.maximum(own, other), box, K, 8, DEPTHS).pose(centroid)
         angle, difference = distance(found, T)
         assert angle < 20
         assert difference < 0.12
@@ -44,9 +44,8 @@ def test_the_pose_is_found_without_peaks(make_scene, box, pose, K, hidden):
 
 
 def test_maps_without_corners_give_a_pose_at_the_centroid(box, K):
-    found = search_pose(
-        np.zeros((9, 52, 52), np.float32), np.array([90.0, 40.0]), box, K, 8, (1, 1)
-    )
+    search = PoseSearch(np.zeros((9, 52, 52), np.float32), box, K, 8, (1, 1))
+    found = search.pose(np.array([90.0, 40.0]))
     assert_allclose(project_keypoints(box, found, K)[8], [90, 40], atol=1e-6)
     assert transform(found, box[8])[2] == pytest.approx(1.0)
 

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix, Transform, rotation_lever
 from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.inference.network_input import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
@@ -67,9 +67,7 @@ class PosedImage:
 
         ``position`` is the object's origin in the camera frame, metres.
         """
-        x, y, z = position
-        lever = np.eye(6)  # a rotation about the camera's centre shifts the object's origin
-        lever[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+        lever = rotation_lever(position)  # from a rotation about the camera's centre
         return np.asarray(lever @ self.error @ lever.T)
 
     def to_world(

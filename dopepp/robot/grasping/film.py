@@ -51,8 +51,8 @@ def show(
         attempts = trials.attempts(trials.scene(record.number), first)
         attempt = next(islice(attempts, record.attempt - 1, None), None)
         if attempt is None:  # a trial is not exactly repeatable in another process
-            place = f"attempt {record.attempt} of trial {record.number}"
-            _log.warning("no image of %r: %s did not happen again", failure, place)
+            failed_attempt = f"attempt {record.attempt} of trial {record.number}"
+            _log.warning("no image of %r: %s did not happen again", failure, failed_attempt)
             continue
         write_image(folder / f"{failure.replace(' ', '_')}.jpg", strip(trials, attempt))
     if video is not None or rerun is not None:
