@@ -56,7 +56,7 @@ _WARM_UP = 0.05  # share of the time in which the learning rate grows
 _PILES = 60  # heaps per block of images
 _BLOCK = 10_000  # images that share heaps
 _CAMERA = "{width: 640, height: 480, fx: 605.0, fy: 605.0, cx: 319.5, cy: 239.5}"
-_HEAP = (f"++virtual.scene.table.pile={{piles: {_PILES}, mixed_share: 0.2}}",)
+_HEAP = f"++virtual.scene.table.pile={{piles: {_PILES}, mixed_share: 0.2}}"
 
 
 class Stream(NamedTuple):
@@ -75,8 +75,8 @@ class Stream(NamedTuple):
 
 STREAMS = (
     Stream(0.4, 0.25, ("seen_on=front",)),
-    Stream(0.35, 0.12, ("seen_on=bin", "materials=mixed", *_HEAP)),
-    Stream(0.25, 0.12, ("seen_on=bin", "materials=metal", *_HEAP)),
+    Stream(0.35, 0.12, ("seen_on=bin", "materials=mixed", _HEAP)),
+    Stream(0.25, 0.12, ("seen_on=bin", "materials=metal", _HEAP)),
 )
 
 
