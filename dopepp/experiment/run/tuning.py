@@ -55,6 +55,7 @@ from dopepp.parts.part import Part, Parts
 from dopepp.recovery.detection import (
     FEATURES,
     PASSING,
+    PROBABLE,
     REFINED_FEATURES,
     Detection,
     RecoveryOptions,
@@ -79,7 +80,9 @@ MIN_REFINED: Final = 20  # smallest number of correct poses that determine a cov
 MAX_INSTANCES: Final = 500
 """Number of instances per part on which tuning fits and measures: heaps need only few images."""
 
-MAX_LOST: Final = 0.01  # largest share of correct refined poses below the threshold
+MAX_LOST: Final = 0.01
+"""Largest share of correct poses that a threshold above :data:`~.detection.PROBABLE` may reject."""
+
 SAME: Final = 0.005  # largest decrease of the average precision with fitted factors
 
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
@@ -407,18 +410,19 @@ def _refined_threshold(
 ) -> float:
     """Return the smallest score of a reported refined pose.
 
-    The threshold for the rate of false positives (``silent``) applies if it rejects at most the
-    share :data:`MAX_LOST` of the correct poses, because otherwise a single frame with a high score
-    could cost most poses. The threshold is at least :data:`MIN_REFINED_SCORE`.
+    The threshold for the rate of false positives (``silent``) applies up to :data:`PROBABLE`: poses
+    with lower scores are more likely incorrect than correct. Above, the threshold may reject only
+    the share :data:`MAX_LOST` of the correct poses, because otherwise a single frame with a high
+    score could cost most poses. The threshold is at least :data:`MIN_REFINED_SCORE`.
     """
     correct = score(shown.features, weights)[shown.correct]
-    most = float(np.quantile(correct, MAX_LOST)) if len(correct) else 1.0
+    most = max(float(np.quantile(correct, MAX_LOST)), PROBABLE) if len(correct) else 1.0
     if silent > most:
         _log.warning(
             "poses on frames without the objects have scores up to %.2f; the threshold is %.2f, "
             "because a higher threshold would lose over %.0f %% of the correct poses",
             silent,
-            max(most, MIN_REFINED_SCORE),
+            most,
             100 * MAX_LOST,
         )
     return max(min(silent, most), MIN_REFINED_SCORE)

@@ -36,7 +36,7 @@ from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts import load_part
-from dopepp.recovery.detection import FEATURES, REFINED_FEATURES, Detection, score
+from dopepp.recovery.detection import FEATURES, PROBABLE, REFINED_FEATURES, Detection, score
 from tests.data.makers import MadeSource
 
 
@@ -279,11 +279,13 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     loud = replace(nothing, features=np.array([[1.0, 0.0, 20.0]]), correct=np.zeros(1, bool))
     loud = replace(loud, scores=np.zeros(1), image=np.zeros(1, int))
     assert choose(shown, loud, 1.0, refined=True)["refined_min_score"] == 0.0
-    # One deceptive frame costs a hundredth of the correct poses, not all of them.
-    options = choose(shown, loud, 0.0, refined=True)
+    # A deceptive frame costs poses that are probably wrong, and a hundredth of the correct ones.
+    assert choose(shown, loud, 0.0, refined=True)["refined_min_score"] == PROBABLE
+    sure = replace(shown, features=features + np.outer(correct, [0.0, 0.0, 6.0]))
+    options = choose(sure, loud, 0.0, refined=True)
     weights = np.array([options[f"refined_{name}"] for name in REFINED_FEATURES])
-    lost = score(shown.features, weights)[correct] < options["refined_min_score"]
-    assert options["refined_min_score"] < 0.9
+    lost = score(sure.features, weights)[correct] < options["refined_min_score"]
+    assert PROBABLE < options["refined_min_score"] < 1.0
     assert lost.mean() == pytest.approx(MAX_LOST, abs=0.02)
     assert "a higher threshold would lose" in caplog.text
     # If all poses are correct, the weights stay at their defaults.
