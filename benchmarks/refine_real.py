@@ -1,6 +1,6 @@
 """Refinement on real frames of a BOP data set.
 
-    python benchmarks/refine_real.py FOLDER [--checkpoint CKPT] [--half even] [--pictures SHEET.png]
+    python benchmarks/refine_real.py FOLDER [--checkpoint CKPT] [--half even]
 
 Start poses are the detections of a network (``--checkpoint``). Without a network, they are drawn
 around the published poses: shifted by 10 mm and rotated by 5°, both in random directions. With
@@ -28,13 +28,10 @@ import numpy as np
 import torch
 from common import pose_errors, print_head, print_row, random_step, timed
 
-from dopepp.core.files import write_png
 from dopepp.core.json import read_json
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
 from dopepp.data.sample import Instance
-from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import RGBImage, read_rgb
-from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -201,11 +198,6 @@ def main() -> None:
         "--spread", type=float, default=1.0, help="factor on the errors of drawn starts"
     )
     parser.add_argument("--from-truth", action="store_true", help="start at the published poses")
-    parser.add_argument(
-        "--pictures",
-        type=Path,
-        help="file for a sheet of every 20th pose: truth green, start blue, refined yellow",
-    )
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     parts = parts_by_id(arguments.folder, bop_parts(arguments.folder))
@@ -219,10 +211,7 @@ def main() -> None:
     frames = chain.from_iterable(read_frames(scene, HALVES[arguments.half]) for scene in scenes)
     starts = [(frame, *start) for frame in frames for start in method.starts(frame)]
     rows: dict[str, list[np.ndarray]] = {}
-    tiles: list[Tile] = []
-    for limit, (count, (frame, number, true, start)) in product(
-        arguments.scale_errors, enumerate(starts)
-    ):
+    for limit, (frame, number, true, start) in product(arguments.scale_errors, starts):
         part, given = parts[number], (frame, number, start, limit)
         pose, took = timed(lambda given=given: method.refine(*given))  # type: ignore[misc]
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
@@ -238,25 +227,12 @@ def main() -> None:
         row = np.array([*before, *after, *rest])
         for name in (part.name, "all"):
             rows.setdefault(f"{name}, scale {limit:g}", []).append(row)
-        if arguments.pictures is not None and count % 20 == 0:
-            wireframes = [
-                Wireframe(project_keypoints(part.cuboid, T, frame.K), colour, name)
-                for T, colour, name in (
-                    (true, GREEN, "true"),
-                    (pose.start, BLUE, "start"),
-                    (pose.end, YELLOW, "refined"),
-                )
-            ]
-            caption = f"{part.name}: {before[0]:.1f} to {after[0]:.1f} mm"
-            tiles.append(Tile(overlay(frame.image, wireframes), caption))
     print_head(
         "object", "poses", "ADD mm", "ADD-0.1d", "rotation °", "translation mm", "distance %",
         "MSPD px", "worse by 1 mm", "kept", "normalised error", "ms",
     )  # fmt: skip
     for name, poses in rows.items():
         print_row(*medians(name, poses))
-    if arguments.pictures is not None:
-        write_png(arguments.pictures, contact_sheet(tiles, 4))
 
 
 if __name__ == "__main__":

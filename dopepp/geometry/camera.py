@@ -59,8 +59,7 @@ def move_pose(T_cam_obj: Transform, step: Step) -> Transform:
 def rotation_lever(offset: Vector) -> Float[np.ndarray, "6 6"]:
     """Return the matrix from a rotation about a point, with a shift, to the step of a pose.
 
-    Args:
-        offset: Object's origin relative to the point, camera axes, metres.
+    ``offset`` is the object's origin relative to the point, camera axes, metres.
     """
     x, y, z = offset
     lever = np.eye(6)
@@ -141,14 +140,8 @@ def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
 class Letterbox:
     """Resizing of an image to fit into a network's input, before padding.
 
-    Padding on the right and at the bottom leaves K unchanged. The scales of the two axes differ by
-    the rounding to whole pixels.
-
-    Attributes:
-        width: Width of the resized image, pixels.
-        height: Height of the resized image, pixels.
-        scale_x: Width of the resized image over the original width.
-        scale_y: Height of the resized image over the original height.
+    Padding on the right and at the bottom leaves K unchanged. The scales of the two axes (new over
+    old size) differ by the rounding to whole pixels.
     """
 
     width: int

@@ -12,7 +12,6 @@ from jaxtyping import Float, Float32, Int16
 
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
-from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.parts.part import Part
 from dopepp.virtual.sensor import Sensor
@@ -218,10 +217,8 @@ class Scene:
         """Return the static scene as seen by another camera with the same lens and sensor.
 
         The background is warped by the plane's homography or, without a plane, by rotation only.
-        Pixels outside the old image are filled by reflection at its border.
-
-        Args:
-            T_new_cam: Transform from this camera to the other, metres.
+        Pixels outside the old image are filled by reflection at its border. ``T_new_cam`` maps this
+        camera's frame into the other's, metres.
         """
         R, shift = T_new_cam[:3, :3], T_new_cam[:3, 3]
         homography, plane = R, self.plane
@@ -248,14 +245,10 @@ class Scene:
         )
 
     def keypoints(self, index: int) -> Float[np.ndarray, "9 2"]:
-        """Return a target's projected corners and centroid, pixels.
-
-        Raises:
-            ValueError: The object is a distractor.
-        """
+        """Return a target's projected corners and centroid, pixels; distractors have none."""
         item = self.objects[index]
         if item.part is None:
-            raise ValueError(f"object {index} is a distractor and has no {NUM_KEYPOINTS} keypoints")
+            raise ValueError(f"object {index} is a distractor without keypoints")
         return project_keypoints(item.part.cuboid, item.T_cam_obj, self.K)
 
 

@@ -30,15 +30,9 @@ Cell = tuple[int, int]  # x and y
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Sample a view of the table, and add targets and distractors to a composition.
+    """Add targets and distractors on the table to a composition, and return the view T_cam_table.
 
-    Args:
-        composition: Composition of the image, whose generator is used.
-        table: Distribution of the views and resting poses.
-        targets: Targets of the image.
-
-    Returns:
-        T_cam_table (plane z = 0, z up).
+    The plane is z = 0, and z points up. Views and resting poses are sampled from ``table``.
     """
     rng = composition.rng
     # Sample another view if no target fits into the image.

@@ -11,7 +11,7 @@ from PIL import Image
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_picture
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual import Factory, Preset, preset_of
+from dopepp.virtual import Factory
 from dopepp.virtual.backgrounds import (
     PhotoBackgrounds,
     ProceduralBackgrounds,
@@ -19,6 +19,7 @@ from dopepp.virtual.backgrounds import (
     procedural,
 )
 from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
+from dopepp.virtual.presets import Preset, preset_of
 
 
 def write_photos(folder, count, side=40):

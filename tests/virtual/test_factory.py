@@ -12,8 +12,9 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Mesh, make_part
-from dopepp.virtual import PRESETS, Distractors, Factory, Sensors, render
-from dopepp.virtual.sensor import capture
+from dopepp.virtual import PRESETS, Factory, render
+from dopepp.virtual.body import Distractors
+from dopepp.virtual.sensor import Sensors, capture
 
 DIGEST = """
 import sys

@@ -8,10 +8,11 @@ import pytest
 import dopepp.core.errors
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, transform
-from dopepp.virtual import Factory, heap, visible_fractions
+from dopepp.virtual import Factory, heap
 from dopepp.virtual.presets import preset_of
 from dopepp.virtual.presets.table import Pile
 from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.renderers.raster import visible_fractions
 from tests.virtual.conftest import draw_scenes
 
 BOX = np.array([0.10, 0.06, 0.02])  # sides of ``box_part``
