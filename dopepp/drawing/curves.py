@@ -23,8 +23,7 @@ from dopepp.drawing.pictures import RGBImage
 MAX_THRESHOLD: Final = 0.1
 """Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)."""
 
-_NUM_STEPS: Final = 200
-"""Number of steps of a curve, 0.5 mm each up to 0.1 m."""
+_NUM_STEPS: Final = 200  # of a curve, 0.5 mm each
 
 _SMOOTHING: Final = 50
 """Lines with more points are drawn pale, below their moving average over 1/50 of the points."""
@@ -52,10 +51,8 @@ def accuracy_figure(
 ) -> Figure:
     """Draw accuracy-threshold curves of several methods, with their exact AUC in the legend.
 
-    Args:
-        curves: Pose error of each instance by method, metres; infinite for a miss.
-        title: Title of the figure.
-        colours: Matplotlib colours by method (default: matplotlib's cycle).
+    ``curves`` are the pose errors of each instance by method, metres; infinite for a miss.
+    ``colours`` are Matplotlib's by default.
     """
     figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():

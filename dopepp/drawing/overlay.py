@@ -87,12 +87,9 @@ def draw_wireframe(
 ) -> RGBImage:
     """Draw the edges of a projected cuboid, anti-aliased, on a copy of the image.
 
-    Args:
-        image: Image to copy.
-        keypoints: Eight corners in NDDS order and the centroid, pixels; edges with a keypoint that
-            is not finite are left out.
-        colour: Colour of the +z face; other edges are darker.
-        thickness: Width of the back edges, pixels; edges of the +z face are one pixel wider.
+    ``keypoints`` are eight corners in NDDS order and the centroid, pixels; edges with a keypoint
+    that is not finite are left out. Edges of the +z face are a pixel wider than ``thickness`` and
+    brighter than the others.
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)

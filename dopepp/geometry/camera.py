@@ -70,10 +70,9 @@ def rotation_lever(offset: Vector) -> Float[np.ndarray, "6 6"]:
 def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
     """Return T_new_cam, from a camera's frame to its frame after an orbit around a point.
 
-    Args:
-        point: Centre of the orbit in the camera's original frame, metres.
-        angle: Angle between the two lines of sight to the point, radians.
-        direction: Angle of the rotation axis from x in the image plane, radians.
+    ``point`` is the centre of the orbit in the original frame, metres; ``angle`` lies between the
+    two lines of sight to the point, and ``direction`` from x in the image plane to the rotation
+    axis, radians.
     """
     axis = np.array([math.cos(direction), math.sin(direction), 0.0])
     R = rotation_vector_to_matrix(angle * axis)

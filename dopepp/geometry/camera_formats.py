@@ -131,9 +131,7 @@ def _words(element: ElementTree.Element) -> object:
 def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibration:
     """Return the calibration in the named fields of a file or a ROS message.
 
-    Args:
-        content: Fields by name, regardless of capitals and underscores.
-        source: Origin of the fields, for messages.
+    Capitals and underscores of the names do not matter.
 
     Raises:
         UserError: The camera matrix is missing, the lens is not OpenCV's pinhole model, or a field

@@ -43,14 +43,8 @@ def focal_factor(
 ) -> Focal | None:
     """Fit a focal length, together with the pose, to the detected keypoints of an object.
 
-    Args:
-        cuboid: Keypoints of the object, metres.
-        keypoints: Detected positions of the keypoints, pixels; NaN if missing.
-        T_cam_obj: Pose estimated with K, metres; start of the fit.
-        K: Camera matrix, pixels.
-
-    Returns:
-        The correction, or None with fewer than eight keypoints.
+    Missing ``keypoints`` (pixels) are NaN. ``T_cam_obj``, estimated with K, starts the fit. With
+    fewer than eight keypoints, the result is None.
     """
     is_known = np.isfinite(keypoints).all(axis=1)
     if is_known.sum() < MIN_POINTS:

@@ -123,12 +123,9 @@ def mean_vectors(
     Where discs overlap, a cell's vector belongs to the nearest peak. At distance d, the weight
     1 − (d/radius)² falls to 0 at the disc's edge, where inexact positions make vectors uncertain.
 
-    Args:
-        vectors: x and y component of the field, (2, height, width).
-        cells: (column, row) of each peak.
-        position: Fitted (x, y) of each peak, cells.
-        radius: Radius of the discs, cells.
-        toward: Filled with the mean vector of each peak; must be zero on entry.
+    ``vectors`` are the field's components (2, height, width), ``cells`` the (column, row) and
+    ``position`` the fitted (x, y) of each peak, cells. ``toward``, zero on entry, is filled with
+    the mean vector of each peak.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)

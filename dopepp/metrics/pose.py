@@ -173,11 +173,7 @@ class PoseMetrics(Metric):
     ) -> None:
         """Add the detections and the ground truth of one image.
 
-        Args:
-            detections: Detections of the evaluated parts.
-            instances: Ground truth of the image.
-            K: Camera matrix, pixels; MSPD needs it for every image.
-            width: Width of the image, pixels; given together with K.
+        MSPD needs K and the width of every image, pixels.
 
         Raises:
             UserError: A detection is of another object.
@@ -272,7 +268,6 @@ class EvaluatedInstances:
     """All evaluated instances of one object, and the scores of its false positives.
 
     Attributes:
-        part: The object.
         T_gt: True poses, metres.
         K: Camera matrices, pixels; NaN if unknown.
         visible_fractions: Visible share of each silhouette, in [0, 1].

@@ -91,9 +91,9 @@ class Factory:
     def render(self, epoch: int, index: int, scale: float = 1.0, view: int = 0) -> Rendered:
         """Render an image with its ground truth, including the sensor's effects.
 
-        The targets are magnified by ``scale``. Camera ``view`` 0 of the static scene is the preset's;
-        others are turned by :data:`BESIDE_DEG` about the middle of the targets and stay above the
-        table.
+        The targets are magnified by ``scale``. Camera ``view`` 0 of the static scene is the
+        preset's; others are turned by :data:`BESIDE_DEG` about the middle of the targets and stay
+        above the table.
 
         Raises:
             UserError: The preset cannot show the part, or the camera would be below the table.

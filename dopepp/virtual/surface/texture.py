@@ -151,13 +151,9 @@ def sample_texture(
 ) -> None:
     """Sample the texture at an object's fragments, filtered over each pixel's footprint.
 
-    Args:
-        points: Fields ``face``, ``share``, ``x`` and ``y`` of the fragments.
-        hom: Homogeneous pixels of the vertices.
-        faces: Triangles.
-        uv: Texture coordinates of the vertices.
-        texture: Texels and levels of a :class:`Texture`, and the table from sRGB codes.
-        out: Filled with linear RGB, shape (3, n).
+    ``points`` are the fragments' ``face``, ``share``, ``x`` and ``y``, ``hom`` the homogeneous
+    pixels of the vertices, and ``texture`` the texels, levels and table from sRGB codes. ``out``
+    (3, n) is filled with linear RGB.
     """
     face, share, x, y = points
     texels, levels, decode = texture

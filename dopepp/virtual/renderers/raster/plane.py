@@ -170,9 +170,7 @@ def hidden_sky(
 ) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
     """Return the share of the sky over a plane that objects hide; None if all are below the plane.
 
-    Args:
-        frame: Map from the camera frame to (x, y) on the plane and the height above it, metres.
-        objects: Objects that hide the sky.
+    ``frame`` maps the camera frame to (x, y) on the plane and the height above it, metres.
 
     Returns:
         Position (x, y) of the grid's first cell and a cell's side, metres; hidden share per cell.

@@ -231,13 +231,7 @@ def reflect_ambient(
     A dielectric scatters the hemisphere around its normal; its weak gloss is ignored. A metal
     mirrors the hemisphere's colour in the reflected direction, tinted with its albedo; a smoother
     metal mirrors more sharply.
-
-    Args:
-        fragments: Fragments of the object.
-        opened: Share of the ambient light that reaches each point.
-        ambient: Result of :func:`ambient_row`.
-        metallic: 1 for metals, otherwise 0.
-        radiance: Filled with linear RGB.
+    ``opened`` is the share of the light that reaches each point.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
@@ -269,13 +263,7 @@ def reflect_panels(
     """Add the light of distant panels: scattered by a dielectric, mirrored by a metal.
 
     A GGX lobe of width α spreads a mirror image by √2 α along both axes.
-
-    Args:
-        fragments: Fragments of the object.
-        opened: Share of the ambient light that reaches each point.
-        panels: Result of :func:`panel_rows`.
-        metallic: 1 for metals, otherwise 0.
-        radiance: Linear RGB, increased in place.
+    ``opened`` is the share of the ambient light that reaches each point.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
@@ -314,13 +302,9 @@ def reflect_light(
 ) -> None:
     """Add the reflection of a point light: Lambert, and GGX with Smith's and Schlick's factors.
 
-    Args:
-        fragments: Fragments of the object.
-        lit: Share of the light that reaches each point.
-        light: Field ``light`` of the light's :class:`ShadowMap`.
-        specular: Reflectance of a dielectric at normal incidence.
-        metallic: 1 for a metal, whose reflectance is its albedo.
-        radiance: Linear RGB, increased in place.
+    ``lit`` is the share of the light that reaches each point, and ``light`` a field of
+    :class:`ShadowMap`. ``specular`` is a dielectric's reflectance at normal incidence; a metal's is
+    its albedo. ``radiance`` (linear RGB) is increased in place.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
