@@ -28,8 +28,7 @@ K = torch.tensor([[1066.8, 0.0, 313.0], [0.0, 1067.5, 241.3], [0.0, 0.0, 1.0]])
 Poses = tuple[Tensor, Tensor, Tensor, Tensor]
 
 PAIRS = 1000
-TURNS = (64, 315)
-"""Numbers of symmetries; 1,000 would take 7 GB."""
+TURNS = (64, 315)  # Numbers of symmetries; 1,000 would take 7 GB
 
 
 def draw_poses(pairs: int, rng: np.random.Generator) -> Poses:

@@ -34,8 +34,7 @@ from dopepp.virtual.scene import Grooves, Material
 from dopepp.virtual.sensor import capture
 
 SEED = 991
-CAD_ERROR = 0.0003
-"""Metres that are added to the mesh everywhere."""
+CAD_ERROR = 0.0003  # Metres that are added to the mesh everywhere
 
 
 def on_target(change: Callable[[Material], Material]) -> Callable[[Scene], Scene]:

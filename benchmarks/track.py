@@ -42,16 +42,11 @@ from dopepp.virtual.scene import Light, Material
 from dopepp.virtual.sensor import capture
 
 SIZE = (640, 480)
-REST = 60
-"""Number of frames at each end without motion."""
-
+REST = 60  # Number of frames at each end without motion
 COVERED = range(190, 205)
 PASSING = range(110, 160)
-WITHIN = (5.0, 2.0)
-"""Largest errors of a correct pose, millimetres and degrees."""
-
-LEAST_VISIBLE = 0.3
-"""Visible share of the part from which a frame is evaluated."""
+WITHIN = (5.0, 2.0)  # Largest errors of a correct pose, millimetres and degrees
+LEAST_VISIBLE = 0.3  # Visible share of the part from which a frame is evaluated
 
 
 @dataclass(frozen=True)

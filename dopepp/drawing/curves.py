@@ -20,9 +20,7 @@ from matplotlib.figure import Figure
 from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.pictures import RGBImage
 
-MAX_THRESHOLD: Final = 0.1
-"""Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)."""
-
+MAX_THRESHOLD: Final = 0.1  # Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)
 _NUM_STEPS: Final = 200  # of a curve, 0.5 mm each
 
 _SMOOTHING: Final = 50

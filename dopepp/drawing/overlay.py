@@ -20,21 +20,14 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
-Colour = tuple[int, int, int]
-"""Red, green and blue, 0 to 255."""
+Colour = tuple[int, int, int]  # Red, green and blue, 0 to 255
 
 YELLOW: Final[Colour] = (255, 221, 0)
 """Colour of predictions, or of DOPE++ in a comparison of two networks (paper Fig. 14)."""
 
-GREEN: Final[Colour] = (40, 220, 60)
-"""Colour of the ground truth."""
-
-BLUE: Final[Colour] = (70, 165, 255)
-"""Colour of the DOPE baseline (paper Fig. 14)."""
-
-WHITE: Final[Colour] = (255, 255, 255)
-"""Colour of captions."""
-
+GREEN: Final[Colour] = (40, 220, 60)  # Colour of the ground truth
+BLUE: Final[Colour] = (70, 165, 255)  # Colour of the DOPE baseline (paper Fig. 14)
+WHITE: Final[Colour] = (255, 255, 255)  # Colour of captions
 MIN_WIDTH_PX: Final = 640  # narrower images are enlarged, for readable lines and legends
 
 _FRACTION_BITS: Final = 4  # sub-pixel coordinates of cv2 are integers, here in 1/16 pixel

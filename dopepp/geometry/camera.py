@@ -19,11 +19,9 @@ from dopepp.geometry.rotation import (
     rotation_vector_to_matrix,
 )
 
-Transform = Float[np.ndarray, "4 4"]
-"""Rigid transform ``T_a_b`` from frame b into frame a, metres."""
+Transform = Float[np.ndarray, "4 4"]  # Rigid transform ``T_a_b`` from frame b into frame a, metres
 
-CameraMatrix = Float[np.ndarray, "3 3"]
-"""K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
+CameraMatrix = Float[np.ndarray, "3 3"]  # K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels
 
 Step = Float[np.ndarray, "6"]
 """Rotation vector about the object's origin (radians) and shift (metres), in camera axes."""

@@ -35,8 +35,7 @@ from dopepp.geometry.camera_formats import (
     parse_calibration,
 )
 
-Crop = tuple[int, int, int, int]
-"""x and y of the upper left pixel, width and height, pixels."""
+Crop = tuple[int, int, int, int]  # x and y of the upper left pixel, width and height, pixels
 
 MAX_BYTES: Final = 250_000
 """Largest size of a camera file, more than any calibration; parsing as much YAML takes 10 s."""

@@ -22,8 +22,7 @@ from dopepp.core.validation import Range, check, short_repr
 from dopepp.core.yaml import parse_yaml
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, pinhole_matrix
 
-Size = tuple[int, int]
-"""(width, height), pixels."""
+Size = tuple[int, int]  # (width, height), pixels
 
 FORMATS: Final = (
     "ROS camera_info, OpenCV FileStorage, BOP camera.json, COLMAP cameras.txt, "

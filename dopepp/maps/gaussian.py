@@ -29,15 +29,9 @@ ROUNDING: Final = 1e-6  # above the rounding errors of squared distances, cells�
 PLATEAU: Final = 3  # Number of cells as high as the peak that indicates a clamped top
 
 STEPS: Final = 3  # Gauss–Newton steps; without noise, the start is exact.
-
-MAX_EXPONENT: Final = 10.0
-"""Largest logarithm of a fitted Gaussian, relative to the peak's belief."""
-
+MAX_EXPONENT: Final = 10.0  # Largest logarithm of a fitted Gaussian, relative to the peak's belief
 CONVERGED: Final = 1e-4  # Largest parameter change at convergence: 1e-3 px at stride 8
-
-SHAPE_PRIOR: Final = 0.5
-"""Prior standard deviation of a peak's curvature, relative to the target's."""
-
+SHAPE_PRIOR: Final = 0.5  # Prior standard deviation of a peak's curvature, relative to the target's
 RIDGE: Final = 1e-14  # Determines directions in which no cell exceeds the floor.
 MIN_CURVATURE: Final = 1e-3  # 1/cells²: a standard deviation of 22 cells
 

@@ -28,15 +28,9 @@ from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
-
-MAX_MATCHING_RADIUS: Final = 0.1
-"""Largest matching radius of any part, metres."""
-
-MIN_VISIBLE_FRACTION: Final = 0.1
-"""Smallest visible share of an evaluated instance's silhouette."""
-
-CurveMeasure = Literal["add", "add_s", "mssd"]
-"""Error in metres, for accuracy-threshold curves."""
+MAX_MATCHING_RADIUS: Final = 0.1  # Largest matching radius of any part, metres
+MIN_VISIBLE_FRACTION: Final = 0.1  # Smallest visible share of an evaluated instance's silhouette
+CurveMeasure = Literal["add", "add_s", "mssd"]  # Error in metres, for accuracy-threshold curves
 
 InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
 """Error of every instance, degrees or metres."""

@@ -27,8 +27,7 @@ from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
 
-WALL: Final = 0.03
-"""Thickness of a bin's walls, divided by the side length of its interior."""
+WALL: Final = 0.03  # Thickness of a bin's walls, divided by the side length of its interior
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,9 +33,7 @@ _MIN_REDUCTION: Final = 2.0
 PhotoSplit = Literal["train", "val", "test", "all"]
 
 MIN_PHOTOS: Final = 2  # smallest number of photos in the validation split and in the test split
-HELD_OUT: Final = 0.15
-"""Share of the photos in the validation split, and in the test split."""
-
+HELD_OUT: Final = 0.15  # Share of the photos in the validation split, and in the test split
 _HASHED_BYTES: Final = 2**16  # leading bytes of a photo, whose hash determines the split
 
 _SMALLEST_PX: Final = 30  # smallest valid shorter side of a halving

@@ -48,8 +48,7 @@ class OpenSky:
     values: Float[np.ndarray, "2 points"]
 
 
-_BAKED: Final[dict[bytes, OpenSky]] = {}
-"""Results of this process, by a hash of the mesh."""
+_BAKED: Final[dict[bytes, OpenSky]] = {}  # Results of this process, by a hash of the mesh
 
 
 def bake_open_sky(

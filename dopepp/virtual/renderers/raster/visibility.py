@@ -28,8 +28,7 @@ from dopepp.virtual.triangles import (
     scratch,
 )
 
-Box = tuple[int, int, int, int]
-"""(left, top, right, bottom) in pixels, right and bottom excluded."""
+Box = tuple[int, int, int, int]  # (left, top, right, bottom) in pixels, right and bottom excluded
 
 Extent = tuple[float, float, float, float]
 """Smallest and largest pixel coordinates (left, top, right, bottom)."""
