@@ -60,19 +60,13 @@ PATIENCE_S = 600
 
 @dataclass
 class Tally:
-    """Results of all kills.
+    """Results of all kills."""
 
-    Attributes:
-        phases: Number of kills per phase.
-        lost: Runs that could not be resumed, with the reason.
-        different: Differences between finished runs and the uninterrupted run.
-        finished: Number of finished runs.
-    """
-
-    phases: Counter[str] = field(default_factory=Counter)
-    lost: list[str] = field(default_factory=list)
+    phases: Counter[str] = field(default_factory=Counter)  # Number of kills per phase
+    lost: list[str] = field(default_factory=list)  # Runs that could not be resumed, with the reason
+    # Differences between finished runs and the uninterrupted run.
     different: list[str] = field(default_factory=list)
-    finished: int = 0
+    finished: int = 0  # Number of finished runs
 
 
 def start(*arguments: str, log: Path) -> Process:

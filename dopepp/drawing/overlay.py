@@ -39,12 +39,9 @@ _FRONT_TOP: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [1, 1]).all(axi
 
 @dataclass(frozen=True)
 class Wireframe:
-    """A projected cuboid to draw.
+    """A projected cuboid to draw."""
 
-    Attributes:
-        keypoints: Eight corners in NDDS order and the centroid, pixels; NaN if missing.
-    """
-
+    # Eight corners in NDDS order and the centroid, pixels; NaN if missing.
     keypoints: Float[np.ndarray, "9 2"]
     colour: Colour = YELLOW
     label: str = ""

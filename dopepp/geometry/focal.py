@@ -25,16 +25,11 @@ LENGTHS: Final = (0.5, 1.0, 2.0)  # Initial factors; each search covers half to 
 
 
 class Focal(NamedTuple):
-    """Correction of the focal lengths of a camera matrix.
+    """Correction of the focal lengths of a camera matrix."""
 
-    Attributes:
-        factor: Factor on the focal lengths.
-        deviation: Standard deviation of the factor's logarithm.
-        gain: Ratio of robust reprojection costs per degree of freedom, before to after correction.
-    """
-
-    factor: float
-    deviation: float
+    factor: float  # Factor on the focal lengths
+    deviation: float  # Standard deviation of the factor's logarithm
+    # Ratio of robust reprojection costs per degree of freedom, before to after correction.
     gain: float
 
 

@@ -45,16 +45,11 @@ Whitenings = Float[np.ndarray, "n 2 2"]
 
 
 class Points(NamedTuple):
-    """Points of an object and their images; during refinement centred and of unit size.
+    """Points of an object and their images; during refinement centred and of unit size."""
 
-    Attributes:
-        solid: Positions in the object frame.
-        rays: Measured ray (x/z, y/z) of each point.
-        whitening: Matrix of each point from ray differences to standard deviations of the pixel.
-    """
-
-    solid: ObjectPoints
-    rays: Rays
+    solid: ObjectPoints  # Positions in the object frame
+    rays: Rays  # Measured ray (x/z, y/z) of each point
+    # Matrix of each point from ray differences to standard deviations of the pixel.
     whitening: Whitenings
 
 

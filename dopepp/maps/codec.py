@@ -37,17 +37,13 @@ not change the float64 rank."""
 
 @dataclass(frozen=True)
 class MapGeometry:
-    """Geometry of maps relative to the network's input.
+    """Geometry of maps relative to the network's input."""
 
-    Attributes:
-        stride: Input pixels per cell. Cell i covers pixels ``stride·i … stride·i + stride − 1``,
-            so its centre is pixel ``stride·i + (stride − 1)/2``.
-        sigma: Standard deviation of a target's belief peak, cells.
-        field_radius: Radius of the disc around a corner in which the field is defined, cells.
-    """
-
+    # Input pixels per cell. Cell i covers pixels ``stride·i … stride·i + stride − 1``, so its
+    # centre is pixel ``stride·i + (stride − 1)/2``.
     stride: int = 8
-    sigma: float = 1.0
+    sigma: float = 1.0  # Standard deviation of a target's belief peak, cells
+    # Radius of the disc around a corner in which the field is defined, cells.
     field_radius: float = 2.0
 
     def to_cells(self, pixels: Tensor) -> Tensor:
@@ -115,21 +111,18 @@ def encode(
 
 @dataclass(frozen=True)
 class Peaks:
-    """The highest local maxima of every belief channel, by descending belief.
+    """The highest local maxima of every belief channel, by descending belief."""
 
-    Attributes:
-        position: (x, y) in pixels of the network's input; NaN in an empty slot.
-        score: Belief at the peak's cell; 0 in an empty slot.
-        covariance_px: Covariance of the position, pixels²: the excess variance of the peak over a
-            target peak, plus the variance of the fit. A network trained with a proper loss returns
-            the target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Weighted mean (x, y) of the unit vectors of the field around a corner's peak; the
-            more they differ, the shorter it is. Zero for a centroid.
-    """
-
+    # (x, y) in pixels of the network's input; NaN in an empty slot.
     position: Float[np.ndarray, "batch channels peaks 2"]
+    # Belief at the peak's cell; 0 in an empty slot.
     score: Float[np.ndarray, "batch channels peaks"]
+    # Covariance of the position, pixels²: the excess variance of the peak over a target peak, plus
+    # the variance of the fit. A network trained with a proper loss returns the target Gaussian
+    # blurred by its own uncertainty, so variances subtract.
     covariance_px: Float[np.ndarray, "batch channels peaks 2 2"]
+    # Weighted mean (x, y) of the unit vectors of the field around a corner's peak; the more they
+    # differ, the shorter it is. Zero for a centroid.
     toward: Float[np.ndarray, "batch channels peaks 2"]
 
 

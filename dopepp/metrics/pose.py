@@ -63,19 +63,12 @@ class PredictedPose(Protocol):
 
 
 class TruePose(Protocol):
-    """Attributes of a ground-truth instance that :class:`PoseMetrics` reads.
+    """Attributes of a ground-truth instance that :class:`PoseMetrics` reads."""
 
-    Attributes:
-        label: Name of the part.
-        T_cam_obj: True pose, metres.
-        visible_fraction: Visible share of the full silhouette, in [0, 1].
-        wanted: Whether a list of targets names the instance; None without a list.
-    """
-
-    label: str
-    T_cam_obj: Transform
-    visible_fraction: float
-    wanted: bool | None
+    label: str  # Name of the part
+    T_cam_obj: Transform  # True pose, metres
+    visible_fraction: float  # Visible share of the full silhouette, in [0, 1]
+    wanted: bool | None  # Whether a list of targets names the instance; None without a list
 
 
 def matching_radius(part: Part) -> float:

@@ -150,18 +150,14 @@ def draw_view(table: Table, composition: Composition) -> Transform:
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Height maps of a rotated object from below and above, with a border of one cell.
+    """Height maps of a rotated object from below and above, with a border of one cell."""
 
-    Attributes:
-        bottom: Height of the underside above the lowest point, metres; the minimum of a cell and
-            its eight neighbours, to cover the space between centres; infinite outside the object.
-        top: Height of the upper side above the lowest point, metres; −infinite outside the object.
-        corner: x and y of the first cell's centre relative to the object's origin, in cells.
-    """
-
+    # Height of the underside above the lowest point, metres; the minimum of a cell and its eight
+    # neighbours, to cover the space between centres; infinite outside the object.
     bottom: Float32[np.ndarray, "rows columns"]
+    # Height of the upper side above the lowest point, metres; −infinite outside the object.
     top: Float32[np.ndarray, "rows columns"]
-    corner: Cell
+    corner: Cell  # x and y of the first cell's centre relative to the object's origin, in cells
 
 
 class HeightMap:

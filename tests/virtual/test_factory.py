@@ -43,16 +43,6 @@ def digest(rendered):
     return content.hexdigest()
 
 
-def test_shapes_and_types():
-    rendered = make_factory().render(0, 0)
-    assert (rendered.image.shape, rendered.image.dtype) == ((128, 128, 3), np.uint8)
-    assert (rendered.depth.dtype, rendered.instances.dtype) == (np.float32, np.int16)
-    assert rendered.visible_fractions.shape == (len(rendered.scene.objects),)
-    assert rendered.scene.objects[0].label in ("servoholder", "pivconnector")
-    np.testing.assert_array_equal(rendered.depth > 0, rendered.instances >= 0)
-    assert (rendered.scene.keypoints(0).shape, rendered.scene.targets) == ((9, 2), (0,))
-
-
 @pytest.mark.parametrize(
     "name",
     ["table", *(pytest.param(name, marks=pytest.mark.slow) for name in ("quickstart", "bin"))],

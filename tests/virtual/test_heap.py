@@ -186,15 +186,6 @@ def test_a_heap_that_reaches_the_camera_is_shown_without_its_top(box_part):
         assert max(pose[2, 3] for pose in targets) < 0.12
 
 
-def test_both_renderers_draw_a_heap(heaps):
-    scene = heaps[0]
-    fractions = find_renderer("raster")(scene).visible_fractions
-    pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
-    pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
-    traced = find_renderer("photoreal")(scene)
-    np.testing.assert_allclose(traced.visible_fractions, fractions, atol=0.05)
-
-
 def test_a_missing_extra_is_named_in_one_line(box_part, monkeypatch):
     monkeypatch.setattr(dopepp.core.errors, "find_spec", lambda name: None)
     message = r"without the package mujoco.*pip install 'dopepp\[robot\]'"

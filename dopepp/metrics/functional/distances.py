@@ -133,9 +133,7 @@ def mspd(
     arguments are as in :func:`mssd`.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
-    # The last row of K is replaced, so that the projection always divides by the point's depth.
-    to_pixels = _check_cameras(K, len(R_est)).clone()
-    to_pixels[:, 2] = to_pixels.new_tensor([0.0, 0.0, 1.0])
+    to_pixels = _check_cameras(K, len(R_est))
     estimated, true = (
         (to_pixels @ R, (to_pixels @ t[..., None])[..., 0])
         for R, t in ((R_est, t_est), (R_gt, t_gt))

@@ -23,34 +23,20 @@ _ALL_BUT_FIRST: Final = 0b1110  # bits of the samples to skip when all of a pixe
 
 
 class Fragments(NamedTuple):
-    """An object's n visible fragments: arrays that the shading passes read and update.
+    """An object's n visible fragments: arrays that the shading passes read and update."""
 
-    Attributes:
-        pixel: Index of the pixel in the window, row by row, shape (n,).
-        weight: Number of the pixel's samples in the fragment, shape (n,).
-        face: Index of the triangle, or the bitwise complement for a back face, shape (n,).
-        x: Mean column of the samples in the image, shape (n,); ``y`` is the mean row.
-        inverse: Inverse depth of a sample, 1/m, shape (n,).
-        share: Barycentric weights of the triangle's corners, shape (3, n).
-        position: Camera frame, metres, shape (3, n).
-        normal: Unit normal towards the camera, camera frame, shape (3, n).
-        albedo: Linear RGB, shape (3, n).
-        bulge: Height of the smooth surface above the flat triangle, metres, shape (n,).
-        alpha: Width of the GGX lobe, shape (n,).
-    """
-
-    pixel: Array
-    weight: Array
-    face: Array
-    x: Array
+    pixel: Array  # Index of the pixel in the window, row by row, shape (n,)
+    weight: Array  # Number of the pixel's samples in the fragment, shape (n,)
+    face: Array  # Index of the triangle, or the bitwise complement for a back face, shape (n,)
+    x: Array  # Mean column of the samples in the image, shape (n,); ``y`` is the mean row
     y: Array
-    inverse: Array
-    share: Array
-    position: Array
-    normal: Array
-    albedo: Array
-    bulge: Array
-    alpha: Array
+    inverse: Array  # Inverse depth of a sample, 1/m, shape (n,)
+    share: Array  # Barycentric weights of the triangle's corners, shape (3, n)
+    position: Array  # Camera frame, metres, shape (3, n)
+    normal: Array  # Unit normal towards the camera, camera frame, shape (3, n)
+    albedo: Array  # Linear RGB, shape (3, n)
+    bulge: Array  # Height of the smooth surface above the flat triangle, metres, shape (n,)
+    alpha: Array  # Width of the GGX lobe, shape (n,)
 
 
 _GROUP_TYPES: Final = {

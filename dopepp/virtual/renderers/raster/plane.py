@@ -39,21 +39,13 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 class _LitPlane(NamedTuple):
-    """A plane and its lights for compiled code, float32.
+    """A plane and its lights for compiled code, float32."""
 
-    Attributes:
-        to_point: Map from a pixel to its point on the plane and 1/z, shape (4, 3).
-        normal: Unit normal, camera frame.
-        sky: Linear RGB of the ambient light on the plane.
-        lights: Position and colour of every light, see :class:`ShadowMap`, shape (lights, 6).
-        P: Projection of every shadow map, see :class:`ShadowMap`, shape (lights, 3, 4).
-    """
-
-    to_point: Array
-    normal: Array
-    sky: Array
-    lights: Array
-    P: Array
+    to_point: Array  # Map from a pixel to its point on the plane and 1/z, shape (4, 3)
+    normal: Array  # Unit normal, camera frame
+    sky: Array  # Linear RGB of the ambient light on the plane
+    lights: Array  # Position and colour of every light, see :class:`ShadowMap`, shape (lights, 6)
+    P: Array  # Projection of every shadow map, see :class:`ShadowMap`, shape (lights, 3, 4)
 
 
 def darken_plane(
