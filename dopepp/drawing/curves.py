@@ -134,12 +134,9 @@ def rates_figure(
 ) -> Figure:
     """Draw panels row by row, with a line and a confidence band for each method.
 
-    Args:
-        panels: Curves by title of the panel and name of the method.
-        x_label: Label of the x axes: the quantity with its unit.
-        columns: Number of panels per row.
-        edges: Values of x to mark by vertical lines, e.g. limits of bins.
-        ratio: Whether the x axis is logarithmic, with ticks at the curves' values of x.
+    ``panels`` has the curves by title of the panel and name of the method. Vertical lines mark the
+    ``edges``, values of x. With ``ratio``, the x axis is logarithmic, with ticks at the curves'
+    values of x.
     """
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")

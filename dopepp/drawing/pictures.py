@@ -74,10 +74,8 @@ _JPEG_END: Final = b"\xff\xd9"
 def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
     """Read an image in one of :data:`FORMATS` as RGB.
 
-    Args:
-        path: File, with any suffix.
-        longest_px: Maximum of the longer side, pixels. Larger images are downscaled; a JPEG is
-            then decoded at a reduced size, which is faster.
+    Images with a side above ``longest_px`` are downscaled; a JPEG is then decoded at a reduced
+    size, which is faster.
 
     Raises:
         ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
@@ -267,9 +265,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
     Images are repeated or dropped to match their times, and resized to the first image's size.
     Odd sides are padded by one pixel, as the format requires even sides.
 
-    Args:
-        path: Path of the video, with the suffix ``.mp4``.
-        rate: Frames per second.
+    The suffix is ``.mp4``; ``rate`` is in frames per second.
     """
 
     def __init__(self, path: Path, rate: float) -> None:

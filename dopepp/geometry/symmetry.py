@@ -38,10 +38,8 @@ def symmetry_group(
     As in BOP, every step of a continuous symmetry is combined with every discrete symmetry. A part
     with two axes that are not parallel is a ball, whose rotations are 0.2 rad apart.
 
-    Args:
-        discrete: BOP-style rigid transforms without the identity, metres.
-        continuous: BOP-style (axis, offset) pairs, metres.
-        max_step: Largest move of a point at half a diameter from the axis, diameters.
+    Both kinds of symmetries are as in BOP, metres; ``discrete`` lacks the identity. ``max_step`` is
+    the largest move of a point at half a diameter from the axis, diameters.
 
     Raises:
         ValueError: An axis has no length.

@@ -64,12 +64,8 @@ def encode(
     map or not finite are ignored. In the disc around a corner, the field (x, y) is the unit vector
     from this corner to its instance's centroid; where discs overlap, the nearest corner counts.
 
-    Args:
-        keypoints: (x, y) of corners 0–7 and the centroid, pixels of the network's input.
-        object_index: Index (0 to C − 1) of each instance's object; −1 marks padding.
-        num_objects: Number of objects C.
-        map_size: (height, width) of the maps, cells.
-        geometry: Stride, peak width and disc radius.
+    ``keypoints`` are corners 0–7 and the centroid, (x, y) in pixels of the network's input. An
+    ``object_index`` of −1 marks padding. ``map_size`` is (height, width), cells.
     """
     height, width = map_size
     cells = geometry.to_cells(keypoints.float())
@@ -139,12 +135,7 @@ def find_peaks(
     to 1, the peak is the cell with the highest sum of 5×5 cells (usually the middle cell), or else
     the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
 
-    Args:
-        belief: Belief maps, nine channels per object.
-        geometry: Stride, peak width and disc radius.
-        threshold: Belief that a peak exceeds.
-        max_peaks: Number of slots per channel.
-        field: Vector fields, 16 channels per object; without them, ``toward`` is zero.
+    Objects have nine belief channels and 16 field channels; without ``field``, ``toward`` is zero.
     """
     maps = _on_host(belief)
     height, width = maps.shape[2:]

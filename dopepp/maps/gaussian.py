@@ -49,14 +49,10 @@ def fit_peaks(
     b² compensate for their amplification of noise (Guo, IEEE SPM 2011). Gauss–Newton on b then
     removes the bias that noise causes in logarithms.
 
-    Args:
-        belief: Belief map of the channel, (height, width).
-        cells: (column, row) of each peak.
-        half: Half-width of the fitted window, cells.
-        sigma: Standard deviation of a target peak, cells.
-        position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells²: the covariance of the fit
-            plus the fitted variance, reduced by its standard error, in excess of ``sigma``².
+    ``cells`` are (column, row) of each peak, ``half`` is the half-width of the window and ``sigma``
+    the standard deviation of a target peak. ``position`` is filled with (x, y) of each peak, and
+    ``covariance`` with the covariance of the fit plus the fitted variance, reduced by its standard
+    error, in excess of ``sigma``². All lengths are cells.
     """
     (height, width), count, side = belief.shape, len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))

@@ -118,10 +118,7 @@ def is_evaluated(instance: TruePose) -> bool:
 class PoseMetrics(Metric):
     """Accumulates detections and ground truth, image by image, and computes a row per object.
 
-    Args:
-        parts: The evaluated objects, with distinct names. Instances of other objects are ignored.
-        method: Name of the method, for the rows.
-        kwargs: Arguments of :class:`torchmetrics.Metric`.
+    Instances of objects other than ``parts`` are ignored. ``method`` names the rows.
 
     Raises:
         UserError: There are no parts, or names are not distinct.

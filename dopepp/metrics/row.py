@@ -75,14 +75,8 @@ class PoseErrors:
     ) -> PoseErrors:
         """Compute all errors of estimated poses from true poses.
 
-        Args:
-            part: The object.
-            T_est: Estimated poses, metres; NaN for a miss.
-            T_gt: True poses, metres.
-            K: Camera matrices, pixels; NaN if unknown.
-            width: Widths of the images, pixels; NaN if unknown.
-            covariance: Covariances as of :class:`~dopepp.recovery.detection.Detection`; NaN if
-                unknown.
+        ``T_est`` and ``T_gt`` are in metres; K and ``width`` of the images in pixels. Missed poses
+        and unknown numbers are NaN. Covariances are those of detections.
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))

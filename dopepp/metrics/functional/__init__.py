@@ -40,15 +40,10 @@ AucMethod = Literal["exact", "voc"]
 def auc(errors: Errors, max_threshold: float, method: AucMethod = "exact") -> float:
     """Return the area under the accuracy-threshold curve from 0 to ``max_threshold``, in [0, 1].
 
-    Args:
-        errors: Errors in the unit of ``max_threshold``; infinite or NaN for a miss.
-        max_threshold: End of the curve, e.g. 0.1 m.
-        method: ``exact`` integrates the step curve: mean(clip(1 − e / max, 0, 1)). ``voc`` is the
-            rule of the YCB-Video toolbox, which is larger by eₖ / (N·max):
-            (Σ (eᵢ − eᵢ₋₁)·i + (max − eₖ)·k) / (N·max) over the k of N sorted errors ≤ max, e₀ = 0.
-
-    Returns:
-        The area; 0.0 without errors.
+    An infinite or NaN error is a miss. ``exact`` integrates the step curve:
+    mean(clip(1 − e / max, 0, 1)). ``voc`` is the rule of the YCB-Video toolbox, which is larger by
+    eₖ / (N·max): (Σ (eᵢ − eᵢ₋₁)·i + (max − eₖ)·k) / (N·max) over the k of N sorted errors ≤ max,
+    e₀ = 0. Without errors, the area is 0.
     """
     errors = nan_is_miss(to_float64(errors))
     if method == "exact":

@@ -299,12 +299,9 @@ def vsd(
     A pixel is wrong if it shows the object at one pose only. It is also wrong if the distances of
     the surface from the camera at both poses differ by at least the tolerance.
 
-    Args:
-        depth_est: Rendered depth at the estimated pose, metres along z, 0 outside the object.
-        depth_gt: Rendered depth at the true pose, metres.
-        depth: Measured depth, metres; 0 without a measurement, where every surface is visible.
-        K: Camera matrix, pixels.
-        diameter: Diameter of the object, metres; tolerances are :data:`BOP_THRESHOLDS` diameters.
+    ``depth_est`` and ``depth_gt`` are rendered at both poses, metres along z, 0 outside the object;
+    ``depth`` is measured, 0 without a measurement, where every surface is visible. Tolerances are
+    :data:`BOP_THRESHOLDS` times the diameter, metres.
     """
     rays = _ray_lengths(K, depth.shape)
     measured, estimated, true = rays * depth, rays * depth_est, rays * depth_gt

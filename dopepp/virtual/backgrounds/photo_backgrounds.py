@@ -46,10 +46,8 @@ class PhotoBackgrounds:
     A damaged photo is logged and replaced by another random photo, so an image depends only on the
     generator and the files.
 
-    Args:
-        folder: Folder to search recursively for :data:`PHOTO_SUFFIXES`, without hidden files and
-            links to folders. Photos are sorted by relative path.
-        names: Relative paths of the photos, instead of a search.
+    A folder is searched recursively for :data:`PHOTO_SUFFIXES`, without hidden files and links to
+    folders, unless ``names`` gives the photos' relative paths. Photos are sorted by relative path.
 
     Raises:
         UserError: The folder contains no photo; or, in :meth:`draw` and :meth:`frame`, more than 10

@@ -207,10 +207,8 @@ _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 class ClutteredBackgrounds:
     """Backgrounds with pieces of other images: polygons, rotated boxes, ellipses and rings.
 
-    Args:
-        behind: Backgrounds, from which some of the pieces are cut as well.
-        number: Smallest and largest number of pieces.
-        contrast: Smallest and largest factor on the whole image's contrast, about its mean.
+    Some pieces are cut from ``behind``. ``number`` limits the number of pieces, and ``contrast``
+    the factor on the whole image's contrast, about its mean.
     """
 
     def __init__(
