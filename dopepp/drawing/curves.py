@@ -65,9 +65,7 @@ def accuracy_figure(
 
 
 def save_accuracy_curves(
-    path: Path | str,
-    curves: Mapping[str, Float[np.ndarray, "n"]],
-    title: str = "",
+    path: Path | str, curves: Mapping[str, Float[np.ndarray, "n"]], title: str = ""
 ) -> Figure:
     """Write :func:`accuracy_figure`'s curves to ``<path>.png`` and ``.csv``; return the figure.
 

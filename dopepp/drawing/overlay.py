@@ -148,11 +148,7 @@ def _clip(
 
 
 def draw_text(
-    image: RGBImage,
-    text: str,
-    position: tuple[int, int],
-    size_px: int,
-    colour: tuple[int, int, int],
+    image: RGBImage, text: str, position: tuple[int, int], size_px: int, colour: Colour
 ) -> None:
     """Draw a line of text in place on a darkened box, cut off at the image border.
 

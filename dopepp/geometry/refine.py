@@ -140,17 +140,11 @@ def _robust_cost(residuals: Array, gate: float) -> float:
 
 @compiled()
 def normal_equations(
-    points: Points,
-    R: Array,
-    t: Array,
-    residuals: Array,
-    gate: float,
-    hessian: Array,
-    gradient: Array,
+    points: Points, R: Array, t: Array, errors: Array, gate: float, hessian: Array, gradient: Array
 ) -> None:
     """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), with robust weights.
 
-    The residuals are the whitened reprojection errors of :func:`reproject`.
+    The errors are the whitened reprojection errors of :func:`reproject`.
 
     The derivatives of a ray (u, v) = (X, Y)/Z by x_cam are [1, 0, −u]/Z and [0, 1, −v]/Z. Since
     d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
@@ -164,7 +158,7 @@ def normal_equations(
             hessian[c, d] = 0.0
     rows, jacobian = np.empty((2, 6)), np.empty(6)
     for i in range(len(rays)):
-        squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
+        squared = errors[i, 0] ** 2 + errors[i, 1] ** 2
         if not squared >= 0.0:
             continue
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
@@ -183,7 +177,7 @@ def normal_equations(
             for c in range(6):
                 jacobian[c] = a * rows[0, c] + b * rows[1, c]
             for c in range(6):
-                gradient[c] += weight * jacobian[c] * residuals[i, r]
+                gradient[c] += weight * jacobian[c] * errors[i, r]
                 for d in range(c + 1):
                     hessian[c, d] += weight * jacobian[c] * jacobian[d]
     for c in range(6):

@@ -288,11 +288,7 @@ def nan_is_miss(errors: Tensor) -> Tensor:
 
 
 def vsd(
-    depth_est: Depths,
-    depth_gt: Depths,
-    depth: Depths,
-    K: CameraMatrix,
-    diameter: float,
+    depth_est: Depths, depth_gt: Depths, depth: Depths, K: CameraMatrix, diameter: float
 ) -> Float[np.ndarray, "10"]:
     """Return the visible surface discrepancy in [0, 1] for BOP's tolerances (VSD; BOP 2019).
 

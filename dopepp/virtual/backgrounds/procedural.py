@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 from numpy.random import Generator
 
+from dopepp.core.validation import Pair
 from dopepp.drawing.pictures import RGBImage
 
 if TYPE_CHECKING:
@@ -212,10 +213,7 @@ class ClutteredBackgrounds:
     """
 
     def __init__(
-        self,
-        behind: Backgrounds,
-        number: tuple[int, int],
-        contrast: tuple[float, float] = (1.0, 1.0),
+        self, behind: Backgrounds, number: tuple[int, int], contrast: Pair = (1.0, 1.0)
     ) -> None:
         self.behind, self.number, self.contrast = behind, number, contrast
 

@@ -17,6 +17,7 @@ from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, edge_functions, scratch
 
 _DEPTH_GAP: Final = 0.01  # samples of a patch whose depths differ by more hide one another
+Groups = tuple[Array, ...]  # the first fields of :class:`Fragments`
 Mesh = tuple[Array, Array, Array]  # vertices, faces and corner normals
 
 _ALL_BUT_FIRST: Final = 0b1110  # bits of the samples to skip when all of a pixel are alike
@@ -81,12 +82,7 @@ def gather_fragments(
 
 @compiled()
 def _group(
-    window: Box,
-    samples: Samples,
-    first_id: int,
-    patches: Array,
-    offsets: Array,
-    groups: tuple[Array, ...],
+    box: Box, samples: Samples, first_id: int, patches: Array, offsets: Array, groups: Groups
 ) -> int:
     """Group the samples of every pixel by smooth patch, and return the number of groups.
 
@@ -97,8 +93,8 @@ def _group(
     num_faces = patches.shape[0]
     centre = offsets.shape[0] - 1
     number = 0
-    for j in range(window[1], window[3]):
-        for i in range(window[0], window[2]):
+    for j in range(box[1], box[3]):
+        for i in range(box[0], box[2]):
             first = ids[j, i, 0]
             # Mostly one triangle, or nothing, fills a pixel.
             alike = first == ids[j, i, 1] and first == ids[j, i, 2] and first == ids[j, i, 3]

@@ -22,11 +22,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
-from dopepp.virtual.renderers.raster.visibility import (
-    Box,
-    Samples,
-    ShadowMap,
-)
+from dopepp.virtual.renderers.raster.visibility import Box, Samples, ShadowMap
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch

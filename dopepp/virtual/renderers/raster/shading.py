@@ -120,14 +120,9 @@ def _blend_colours(face: Array, share: Array, faces: Array, colours: Array, albe
 
 @compiled(fastmath=True)
 def _tint_albedo(
-    noise: Array,
-    fragments: Fragments,
-    T_cam_obj: Array,
-    focal: float,
-    amplitude: float,
-    pitch: float,
+    noise: Array, fragments: Fragments, T_cam_obj: Array, focal: float, height: float, pitch: float
 ) -> None:
-    """Multiply the albedo by 1 + ``amplitude`` times noise with a lattice of ``pitch`` metres."""
+    """Multiply the albedo by 1 + ``height`` times noise with a lattice of ``pitch`` metres."""
     position, albedo = fragments.position, fragments.albedo
     least, greatest = NOISE_LIMITS
     for p in range(position.shape[1]):
@@ -138,7 +133,7 @@ def _tint_albedo(
         x = position[0, p] - T_cam_obj[0, 3]
         y = position[1, p] - T_cam_obj[1, 3]
         z = position[2, p] - T_cam_obj[2, 3]
-        tint = 1.0 + amplitude * min(fade, 1.0) * _value_noise(
+        tint = 1.0 + height * min(fade, 1.0) * _value_noise(
             noise,
             (T_cam_obj[0, 0] * x + T_cam_obj[1, 0] * y + T_cam_obj[2, 0] * z) / pitch,
             (T_cam_obj[0, 1] * x + T_cam_obj[1, 1] * y + T_cam_obj[2, 1] * z) / pitch,
@@ -293,12 +288,7 @@ def reflect_panels(
 
 @compiled(fastmath=True)
 def reflect_light(
-    fragments: Fragments,
-    lit: Array,
-    light: Array,
-    specular: float,
-    metallic: float,
-    radiance: Array,
+    fragments: Fragments, lit: Array, light: Array, specular: float, metal: float, radiance: Array
 ) -> None:
     """Add the reflection of a point light: Lambert, and GGX with Smith's and Schlick's factors.
 
@@ -308,8 +298,8 @@ def reflect_light(
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
-    base, metal = np.float32(specular), np.float32(metallic)
-    matt = _ONE - metal
+    base, metallic = np.float32(specular), np.float32(metal)
+    matt = _ONE - metallic
     for p in range(position.shape[1]):
         px, py, pz = position[0, p], position[1, p], position[2, p]
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
@@ -334,7 +324,7 @@ def reflect_light(
         # No branch: a point that is not lit adds nothing, and the loop stays a vector loop.
         strength = lit[p] * n_l / square
         for c in range(3):
-            upright = base + metal * (albedo[c, p] - base)
+            upright = base + metallic * (albedo[c, p] - base)
             fresnel = upright + (_ONE - upright) * grazing5
             diffuse = matt * albedo[c, p] * (_ONE - fresnel)
             radiance[c, p] += strength * light[3 + c] * (diffuse + fresnel * lobe)
