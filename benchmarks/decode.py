@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from common import timed
+from common import encoded, timed
 from scipy.spatial.transform import Rotation
 
 from dopepp.data.rendered import RenderedSource
@@ -18,7 +18,7 @@ from dopepp.experiment.results.cost import likely_maps
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.inference.estimator import Maps, PoseEstimator
-from dopepp.maps import MapGeometry, encode, find_peaks
+from dopepp.maps import MapGeometry, find_peaks
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.recovery import recover
 from dopepp.virtual import PRESETS, Factory
@@ -42,14 +42,7 @@ def scene(count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Ten
         t = np.array([(u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1], z])
         T = make_transform(Rotation.random(random_state=rng).as_matrix(), t)
         keypoints.append(project_keypoints(CRACKER_BOX, T, K))
-    belief, field = encode(
-        torch.tensor(np.array(keypoints))[None],
-        torch.zeros(1, count, dtype=torch.long),
-        1,
-        (CELLS, CELLS),
-        MapGeometry(STRIDE),
-    )
-    return belief[0], field[0]
+    return encoded(np.array(keypoints), CELLS, STRIDE)
 
 
 def noisy_maps(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -60,12 +53,11 @@ def noisy_maps(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, tor
     if wrong:
         keypoints += rng.normal(0, 3, keypoints.shape)
         keypoints[0, rng.integers(8)] += rng.uniform(-40, 40, 2)
-    index, cells = torch.zeros(1, 1, dtype=torch.long), (CELLS, CELLS)
-    maps = encode(torch.tensor(keypoints)[None], index, 1, cells, MapGeometry(STRIDE))
+    maps = encoded(keypoints, CELLS, STRIDE)
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     noises = (0.005, 0.05) if wrong else (0.02, 0.05)
     belief, field = (
-        clean[0] + noise * torch.randn(clean[0].shape, generator=generator)
+        clean + noise * torch.randn(clean.shape, generator=generator)
         for clean, noise in zip(maps, noises, strict=True)
     )
     return belief, field

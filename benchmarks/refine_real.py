@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,6 +90,12 @@ def read_frames(scene: Path, half: slice) -> Iterator[Frame]:
                 objects.append((annotation["obj_id"], T))
         pixels = read_rgb(next((scene / "rgb").glob(f"{int(image):06d}.*")))
         yield Frame(pixels, np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float), objects)
+
+
+def read_scenes(folder: Path, split: str, half: str = "both") -> Iterator[Frame]:
+    """Yield the frames of all scenes of a split; ``half`` is a key of :data:`HALVES`."""
+    for scene in sorted((folder / split).iterdir()):
+        yield from read_frames(scene, HALVES[half])
 
 
 class DrawnStarts:
@@ -207,8 +213,7 @@ def main() -> None:
         method = DrawnStarts(parts, arguments.scale_errors, spread, from_truth)
     else:
         method = NetworkStarts(parts, arguments.scale_errors, arguments.checkpoint)
-    scenes = sorted((arguments.folder / arguments.split).iterdir())
-    frames = chain.from_iterable(read_frames(scene, HALVES[arguments.half]) for scene in scenes)
+    frames = read_scenes(arguments.folder, arguments.split, arguments.half)
     starts = [(frame, *start) for frame in frames for start in method.starts(frame)]
     rows: dict[str, list[np.ndarray]] = {}
     for limit, (frame, number, true, start) in product(arguments.scale_errors, starts):

@@ -10,11 +10,10 @@ search the distances of the data set.
 from __future__ import annotations
 
 import argparse
-from itertools import chain
 from pathlib import Path
 
 from common import pose_errors, print_head, print_row, use_one_thread
-from refine_real import HALVES, read_frames
+from refine_real import read_scenes
 
 from dopepp.geometry.camera import Transform
 from dopepp.inference.estimator import PoseEstimator
@@ -43,8 +42,7 @@ def main() -> None:
     use_one_thread()
     network = PoseEstimator.load("pretrained/pivconnector_wide", refine="region")
     (part,) = network.parts
-    scenes = sorted((arguments.folder / "train_pbr").iterdir())
-    frames = list(chain.from_iterable(read_frames(scene, HALVES["both"]) for scene in scenes))
+    frames = list(read_scenes(arguments.folder, "train_pbr"))
     depths = [float(T[2, 3]) for frame in frames for _, T in frame.objects]
     templates = TemplateEstimator.of_parts([part], (min(depths) / SLACK, max(depths) * SLACK))
     print_head("method", "images", "right", "wrong")
