@@ -24,7 +24,7 @@ from dopepp.robot.calibration.quality import assess
 from dopepp.robot.calibration.tool import find_tip
 
 BOARD = parse_board("charuco:9x7:25:18")
-SIZE = (960, 720)
+SIZE, NUM_IMAGES = (960, 720), 24
 TIP = np.array([0.0, 0.02, 0.18])
 
 
@@ -34,7 +34,7 @@ def noisy(T: Transform, rng: np.random.Generator) -> Transform:
     return make_transform(T[:3, :3] @ turn, T[:3, 3] + 3e-4 * rng.normal(size=3))
 
 
-def calibration_errors(seed: int, num_images: int) -> Iterator[list[float]]:
+def calibration_errors(seed: int) -> Iterator[list[float]]:
     """Yield the errors of a seed for a camera in the hand, then for a camera on the bench.
 
     The errors are rotation (°), position (mm), expected position error (mm), focal length (%),
@@ -50,7 +50,7 @@ def calibration_errors(seed: int, num_images: int) -> Iterator[list[float]]:
         for far in (0.1, 0.5)
     )
     flanges, views = [], []
-    for number in range(num_images):
+    for number in range(NUM_IMAGES):
         turn = Rotation.from_euler("zxy", rng.uniform([-1, -0.6, -0.6], [1, 0.6, 0.6])).as_matrix()
         near = rng.uniform(0.3, 0.5) * focal / 850
         middle = np.append(near * rng.uniform(-0.2, 0.2, 2), near)
@@ -81,9 +81,8 @@ def main() -> None:
     """Print a row per mounting: medians over the seeds, with the worst seed in brackets."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--pictures", type=int, default=24, help="images per seed")
     options = parser.parse_args()
-    rows = np.array([[*calibration_errors(n, options.pictures)] for n in range(options.seeds)])
+    rows = np.array([[*calibration_errors(n)] for n in range(options.seeds)])
     print_head("camera", "°", "mm", "expected mm", "focal length %", "tip mm", "doubtful")
     for name, errors in zip(("in the hand", "on the bench"), rows.transpose(1, 0, 2), strict=True):
         medians, worst = np.median(errors, axis=0), errors.max(axis=0)

@@ -1,4 +1,4 @@
-"""Functions that several benchmarks share: pose errors, random steps, CPU times, Markdown rows."""
+"""Functions that several benchmarks share: errors, random steps, maps, CPU times, Markdown rows."""
 
 from __future__ import annotations
 
@@ -40,6 +40,18 @@ def random_step(rng: np.random.Generator, angle: float, shift: float) -> np.ndar
     step[:3] *= angle / np.linalg.norm(step[:3])
     step[3:] *= shift / np.linalg.norm(step[3:])
     return step
+
+
+def encoded(keypoints: np.ndarray, cells: int = 50, stride: int = 8, sigma: float = 1.0):
+    """Return the square belief maps and vector field of an object's instances, (n, 9, 2) pixels."""
+    import torch
+
+    from dopepp.maps import MapGeometry, encode
+
+    index = torch.zeros(1, len(keypoints), dtype=torch.long)
+    geometry = MapGeometry(stride, sigma)
+    belief, field = encode(torch.tensor(keypoints)[None], index, 1, (cells, cells), geometry)
+    return belief[0], field[0]
 
 
 def use_one_thread() -> None:

@@ -60,19 +60,13 @@ PATIENCE_S = 600
 
 @dataclass
 class Tally:
-    """Results of all kills.
+    """Results of all kills."""
 
-    Attributes:
-        phases: Number of kills per phase.
-        lost: Runs that could not be resumed, with the reason.
-        different: Differences between finished runs and the uninterrupted run.
-        finished: Number of finished runs.
-    """
-
-    phases: Counter[str] = field(default_factory=Counter)
-    lost: list[str] = field(default_factory=list)
+    phases: Counter[str] = field(default_factory=Counter)  # Number of kills per phase
+    lost: list[str] = field(default_factory=list)  # Runs that could not be resumed, with the reason
+    # Differences between finished runs and the uninterrupted run.
     different: list[str] = field(default_factory=list)
-    finished: int = 0
+    finished: int = 0  # Number of finished runs
 
 
 def start(*arguments: str, log: Path) -> Process:
@@ -204,14 +198,11 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--epochs", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", type=Path, help="folder to keep the runs in")
     options = parser.parse_args()
     torch.set_num_threads(1)
     Factory([BUILTIN["pivconnector"]()], PRESETS["paper"], 0)  # the surface is cached
     with tempfile.TemporaryDirectory() as temporary:
-        folder = options.folder or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        tally = crash(folder.absolute(), options.kills, options.epochs, options.seed)
+        tally = crash(Path(temporary), options.kills, options.epochs, options.seed)
     kills = ", ".join(f"{count} in {name}" for name, count in sorted(tally.phases.items()))
     print(f"{sum(tally.phases.values())} kills: {kills}")
     print(f"{tally.finished} runs ended, {len(tally.lost)} lost {tally.lost}")

@@ -5,13 +5,12 @@ python benchmarks/decode.py
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import torch
-from common import timed
+from common import encoded, timed
 from scipy.spatial.transform import Rotation
 
 from dopepp.data.rendered import RenderedSource
@@ -19,13 +18,13 @@ from dopepp.experiment.results.cost import likely_maps
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.inference.estimator import Maps, PoseEstimator
-from dopepp.maps import MapGeometry, encode, find_peaks
+from dopepp.maps import MapGeometry, find_peaks
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.recovery import recover
 from dopepp.virtual import PRESETS, Factory
 
 CELLS, STRIDE, REPEATS = 50, 8, 100
-IMAGES = 12
+SEED, IMAGES = 0, 12
 NOISY = 60
 RELEASED = {"pivconnector": "quickstart", "pivconnector_wide": "wide", "servoholder": "quickstart"}
 K = camera_matrix(600, 600, 199.5, 199.5)
@@ -43,14 +42,7 @@ def scene(count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Ten
         t = np.array([(u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1], z])
         T = make_transform(Rotation.random(random_state=rng).as_matrix(), t)
         keypoints.append(project_keypoints(CRACKER_BOX, T, K))
-    belief, field = encode(
-        torch.tensor(np.array(keypoints))[None],
-        torch.zeros(1, count, dtype=torch.long),
-        1,
-        (CELLS, CELLS),
-        MapGeometry(STRIDE),
-    )
-    return belief[0], field[0]
+    return encoded(np.array(keypoints), CELLS, STRIDE)
 
 
 def noisy_maps(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -61,12 +53,11 @@ def noisy_maps(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, tor
     if wrong:
         keypoints += rng.normal(0, 3, keypoints.shape)
         keypoints[0, rng.integers(8)] += rng.uniform(-40, 40, 2)
-    index, cells = torch.zeros(1, 1, dtype=torch.long), (CELLS, CELLS)
-    maps = encode(torch.tensor(keypoints)[None], index, 1, cells, MapGeometry(STRIDE))
+    maps = encoded(keypoints, CELLS, STRIDE)
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     noises = (0.005, 0.05) if wrong else (0.02, 0.05)
     belief, field = (
-        clean[0] + noise * torch.randn(clean[0].shape, generator=generator)
+        clean + noise * torch.randn(clean.shape, generator=generator)
         for clean, noise in zip(maps, noises, strict=True)
     )
     return belief, field
@@ -80,10 +71,7 @@ def milliseconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    seed = parser.parse_args().seed
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     torch.set_num_threads(1)
     print("".join(f"{word:>11}" for word in ("instances", "found", "recover ms", "peaks ms")))
     for count in (1, 3, 10):
@@ -100,17 +88,17 @@ def main() -> None:
     print("\nTest images: the network's own maps, and true maps with the noise of job=cost")
     print(f"{'network':>20}{'own ms':>10}{'peaks':>8}{'noisy ms':>10}{'peaks':>8}")
     for name, preset in RELEASED.items():
-        clean, own_peaks, noisy, noisy_peaks = released(name, preset, seed)
+        clean, own_peaks, noisy, noisy_peaks = released(name, preset)
         print(f"{name:>20}{clean:10.2f}{own_peaks:8.1f}{noisy:10.2f}{noisy_peaks:8.1f}")
 
 
-def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
+def released(name: str, preset: str) -> tuple[float, ...]:
     """Return median ms and mean number of peaks on a network's maps, then on noisy true maps."""
     estimator = PoseEstimator.load(f"pretrained/{name}")
     geometry = MapGeometry(estimator.network.stride, estimator.recovery.sigma)
     part = BUILTIN[estimator.parts[0].name]()
-    source = RenderedSource(Factory([part], PRESETS[preset], seed), IMAGES, "test")
-    generator = torch.Generator().manual_seed(seed)
+    source = RenderedSource(Factory([part], PRESETS[preset], SEED), IMAGES, "test")
+    generator = torch.Generator().manual_seed(SEED)
     rows = []
     for index in range(IMAGES):
         sample = source.sample(index)

@@ -1,7 +1,6 @@
 """First finding of ``dopepp doctor`` on rendered images with a known fault.
 
-    python benchmarks/doctor.py [--images 40] [--seed 81] [--preset quickstart] [--size 640 480]
-                                [--model pretrained/pivconnector] [--faults blur dark …]
+    python benchmarks/doctor.py [--images 40] [--seed 81]
 
 Each row has a fault, the number of images without a finding, and how often each check was the
 first finding.
@@ -121,29 +120,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", type=int, default=40, help="images per fault")
     parser.add_argument("--seed", type=int, default=81)
-    parser.add_argument("--model", default="pretrained/pivconnector")
-    parser.add_argument("--part", default="pivconnector")
-    parser.add_argument("--preset", default="quickstart")
-    parser.add_argument("--size", type=int, nargs=2, help="width height; default: the network's")
-    parser.add_argument("--faults", nargs="+", default=[""], help="words in the faults' names")
-    parser.add_argument("--show", action="store_true", help="print every finding")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    estimator, preset = PoseEstimator.load(arguments.model), PRESETS[arguments.preset]
-    size = arguments.size or estimator.checkpoint.input_size
-    renderer = FaultRenderer(arguments.part, preset.reframed(*size), arguments.seed)
+    estimator = PoseEstimator.load("pretrained/pivconnector")
+    preset = PRESETS["quickstart"].reframed(*estimator.checkpoint.input_size)
+    renderer = FaultRenderer("pivconnector", preset, arguments.seed)
     print_head("fault", "no finding", "first finding")
     for name, take in renderer.faults().items():
-        if not any(word in name for word in arguments.faults):
-            continue
         firsts: Counter[str] = Counter()
         for index in range(arguments.images):
             image, K = take(index)
             results = diagnose(Case(estimator, image, K, estimator.parts))
             findings = [result for result in results if result.fix]
             firsts[findings[0].subject if findings else ""] += 1
-            if arguments.show:
-                print(index, *findings, sep="\n    ")
         fine = firsts.pop("", 0)
         listed = ", ".join(f"{subject} {count}" for subject, count in firsts.most_common())
         print_row(name, f"{fine} of {arguments.images}", listed)

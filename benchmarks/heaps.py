@@ -20,7 +20,8 @@ from dopepp.data.render_job import named_part
 from dopepp.geometry.camera import invert_transform, transform
 from dopepp.parts.convex import convex_pieces
 from dopepp.parts.mesh import SurfaceTree
-from dopepp.virtual import PRESETS, Factory, SceneObject, Surface
+from dopepp.virtual import PRESETS, Factory, SceneObject
+from dopepp.virtual.surface import Surface
 
 SAMPLES = 300  # tested surface points per object
 

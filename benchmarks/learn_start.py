@@ -60,17 +60,11 @@ _HEAP = f"++virtual.scene.table.pile={{piles: {_PILES}, mixed_share: 0.2}}"
 
 
 class Stream(NamedTuple):
-    """A kind of training images.
+    """A kind of training images."""
 
-    Attributes:
-        share: Share of the training images.
-        new_share: Share of new renders; the other images are former renders, augmented anew.
-        overrides: Options of ``train.py`` for the renders.
-    """
-
-    share: float
-    new_share: float
-    overrides: tuple[str, ...]
+    share: float  # Share of the training images
+    new_share: float  # Share of new renders; the other images are former renders, augmented anew
+    overrides: tuple[str, ...]  # Options of ``train.py`` for the renders
 
 
 STREAMS = (

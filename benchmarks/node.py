@@ -1,6 +1,6 @@
 """Lost images and latency of `dopepp node --ros2`, with a simulated camera in another process.
 
-    python benchmarks/node.py --pictures 300 --rate 30
+    python benchmarks/node.py
 
 The node is measured, killed, started again and measured again, while the camera publishes.
 "Received" is the number of images that reached the node. An image is "replaced by newer" if a newer
@@ -10,7 +10,6 @@ its poses.
 
 from __future__ import annotations
 
-import argparse
 import array
 import os
 import subprocess
@@ -29,7 +28,8 @@ from dopepp.virtual import PRESETS, Factory
 
 TOPIC = "/camera/image_raw"
 FRAME = "camera_optical_frame"
-PART = "pivconnector"
+PART, MODEL = "pivconnector", "pretrained/pivconnector"
+SIZE, COUNT, RATE = (320, 240), 300, 30.0  # images per row, and per second
 START_S = 180.0
 NODE_NAME = "dope"
 
@@ -37,12 +37,12 @@ NODE_NAME = "dope"
 class Camera:
     """Publishes images in turn, and receives the node's poses."""
 
-    def __init__(self, size: tuple[int, int]) -> None:
+    def __init__(self) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import QoSProfile
 
-        factory = Factory([load_part(PART)], PRESETS["quickstart"].reframed(*size), 2)
+        factory = Factory([load_part(PART)], PRESETS["quickstart"].reframed(*SIZE), 2)
         rendered = [factory.render(0, number) for number in range(9, 15)]
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": FRAME}
         self.images = [
@@ -54,8 +54,8 @@ class Camera:
             "sensor_msgs/CameraInfo",
             {
                 "header": header,
-                "width": size[0],
-                "height": size[1],
+                "width": SIZE[0],
+                "height": SIZE[1],
                 "distortion_model": "plumb_bob",
                 "d": array.array("d", [0.0] * 5),
                 "k": K.ravel(),
@@ -109,18 +109,18 @@ class Camera:
         self.info_publisher.publish(self.info)
         self.publisher.publish(message)
 
-    def run(self, count: int, rate: float) -> None:
-        """Publish images at a rate (images per second)."""
+    def run(self) -> None:
+        """Publish :data:`COUNT` images at :data:`RATE`."""
         start = time.perf_counter()
-        for number in range(count):
-            time.sleep(max(0.0, start + number / rate - time.perf_counter()))
+        for number in range(COUNT):
+            time.sleep(max(0.0, start + number / RATE - time.perf_counter()))
             self.send(number)
 
 
-def start_node(options: argparse.Namespace) -> subprocess.Popen[bytes]:
+def start_node() -> subprocess.Popen[bytes]:
     """Start the node with the command line."""
     command = [sys.executable, "-c", "from dopepp.cli import app; app()"]
-    words = [*command, "node", options.model, "--ros2"]
+    words = [*command, "node", MODEL, "--ros2"]
     return subprocess.Popen([*words, "--topic", TOPIC, "--name", NODE_NAME])
 
 
@@ -133,7 +133,7 @@ def wait_for(event: str, has_happened: Callable[[], bool], seconds: float = STAR
         time.sleep(0.05)
 
 
-def measure(camera: Camera, count: int, rate: float) -> list[str]:
+def measure(camera: Camera) -> list[str]:
     """Return a row: images sent, received, lost, replaced and answered, and the latency."""
     camera.latency_ms.clear()
     wait_for("the node", lambda: camera.publisher.get_subscription_count() > 0)
@@ -145,37 +145,31 @@ def measure(camera: Camera, count: int, rate: float) -> list[str]:
     before = camera.counts()
     camera.sent.clear()
     camera.latency_ms.clear()
-    camera.run(count, rate)
+    camera.run()
     time.sleep(1.0)
     after = camera.counts()
     received, replaced = (after[key] - before[key] for key in ("received", "replaced by newer"))
     latency = np.array([*camera.latency_ms.values()])
-    counts = count, received, count - received, replaced, len(latency)
+    counts = COUNT, received, COUNT - received, replaced, len(latency)
     times = np.median(latency), np.percentile(latency, 95)
     return [*map(str, counts), *(f"{time_ms:.1f}" for time_ms in times)]
 
 
 def main() -> None:
     """Print a row for the node, and a row after it was killed and started again."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--model", default="pretrained/pivconnector")
-    parser.add_argument("--pictures", type=int, default=300, help="number of images per row")
-    parser.add_argument("--rate", type=float, default=30.0)
-    parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
-    options = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100))
     import rclpy
 
     rclpy.init()
-    camera = Camera(tuple(options.size))
+    camera = Camera()
     print_head(
         "sent", "received", "lost", "replaced by newer", "answered", "latency ms, median", "p95"
     )
     for number in range(2):
-        node = start_node(options)
+        node = start_node()
         try:
-            print_row(*measure(camera, options.pictures, options.rate))
+            print_row(*measure(camera))
         finally:
             node.kill() if number == 0 else node.terminate()
             code = node.wait(30)

@@ -1,6 +1,6 @@
 """Accuracy and time of a network on the same scenes in cameras of different sizes.
 
-    python benchmarks/picture_sizes.py [--checkpoint pretrained/NAME] [--preset wide] [--images 100]
+    python benchmarks/picture_sizes.py
 
 The scenes were not used in training. The shorter side of each camera has the field of view of the
 training's camera, so the part covers the same share of it with more or fewer pixels. The row
@@ -9,7 +9,6 @@ training's camera, so the part covers the same share of it with more or fewer pi
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from dataclasses import replace
@@ -25,7 +24,7 @@ from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory, Scene, render
 from dopepp.virtual.sensor import capture
 
-SEED = 771
+SEED, NUM_IMAGES = 771, 100
 SIZES = ((640, 480), (320, 240), (1920, 1080), (1080, 1920), (2592, 1944))
 
 
@@ -72,16 +71,11 @@ def measure(
 
 def main() -> None:
     """Print a row per camera."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--checkpoint", default="pretrained/pivconnector_wide")
-    parser.add_argument("--preset", default="wide")
-    parser.add_argument("--images", type=int, default=100)
-    arguments = parser.parse_args()
     use_one_thread()
-    estimator = PoseEstimator.load(arguments.checkpoint)
-    preset = PRESETS[arguments.preset].resized(*estimator.checkpoint.input_size)
+    estimator = PoseEstimator.load("pretrained/pivconnector_wide")
+    preset = PRESETS["wide"].resized(*estimator.checkpoint.input_size)
     factory = Factory([load_part(estimator.parts[0].name)], preset, SEED)
-    scenes = [factory.scene(0, index) for index in range(arguments.images)]
+    scenes = [factory.scene(0, index) for index in range(NUM_IMAGES)]
     print_head("camera", "network input", "ADD-0.1d", "rotation °", "missed", "ms")
     print_row(f"training's, {preset.width}×{preset.height}", *measure(estimator, scenes))
     for size in SIZES:

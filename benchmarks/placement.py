@@ -12,7 +12,8 @@ import numpy as np
 
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
-from dopepp.virtual import PRESETS, Factory, OffsetPlacement
+from dopepp.virtual import PRESETS, Factory
+from dopepp.virtual.presets.placement import OffsetPlacement
 
 
 class CountedPlacement(OffsetPlacement):

@@ -39,8 +39,7 @@ from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Scene, SceneObject
 
-UNHIDDEN = 0.98
-"""Smallest visible share; nothing may occlude the part that a render replaces."""
+UNHIDDEN = 0.98  # Smallest visible share; nothing may occlude the part that a render replaces
 
 RING_PX = 12.0
 """Width of the ring around the part that counts as immediate surroundings, network pixels."""

@@ -12,17 +12,16 @@ from itertools import combinations
 import cv2
 import numpy as np
 import torch
-from common import pose_errors
+from common import encoded, pose_errors
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import CENTROID, cuboid_keypoints
 from dopepp.geometry.pnp import solve_pnp
-from dopepp.maps import MapGeometry, encode
 from dopepp.recovery import recover, recover_batch
 
-CELLS, STRIDE, FOCAL = 50, 8, 600.0
+CELLS, STRIDE, FOCAL, CROWD = 50, 8, 600.0, 10
 K = camera_matrix(FOCAL, FOCAL, 199.5, 199.5)
 SIZES = {
     "plate": (0.100, 0.060, 0.007),
@@ -57,11 +56,7 @@ def random_pose(rng: np.random.Generator, u: float, v: float, z: float) -> np.nd
 
 
 def crowd(
-    solid: Solid,
-    rng: np.random.Generator,
-    sigma: float,
-    sizes: tuple[float, float],
-    count: int = 10,
+    solid: Solid, rng: np.random.Generator, sigma: float, sizes: tuple[float, float]
 ) -> tuple[list[np.ndarray], torch.Tensor, torch.Tensor]:
     """Return random poses with centroids at least 60 px apart, and their noisy maps."""
     while True:
@@ -70,7 +65,7 @@ def crowd(
             centre = rng.uniform(20, CELLS * STRIDE - 20, 2)
             if all(np.linalg.norm(centre - other) >= 60 for other in centres):
                 centres.append(centre)
-            if len(centres) == count:
+            if len(centres) == CROWD:
                 break
         else:
             continue
@@ -80,16 +75,10 @@ def crowd(
         for centre in centres
     ]
     keypoints = np.array([project_keypoints(solid.cuboid, T, K) for T in poses])
-    belief, field = encode(
-        torch.tensor(keypoints)[None],
-        torch.zeros(1, count, dtype=torch.long),
-        1,
-        (CELLS, CELLS),
-        MapGeometry(STRIDE, sigma),
-    )
+    belief, field = encoded(keypoints, CELLS, STRIDE, sigma)
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-    belief = belief[0] + 0.02 * torch.randn(belief[0].shape, generator=generator)
-    field = field[0] + 0.05 * torch.randn(field[0].shape, generator=generator)
+    belief = belief + 0.02 * torch.randn(belief.shape, generator=generator)
+    field = field + 0.05 * torch.randn(field.shape, generator=generator)
     return poses, belief, field
 
 
@@ -117,22 +106,16 @@ def crowds(seed: int, frames: int) -> None:
 
 def noisy_maps(keypoints: np.ndarray, covariance: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
     """Return maps with peaks of covariance σ²I + Σ (σ is one cell) at noisy keypoints."""
-    belief, field = encode(
-        torch.tensor(keypoints)[None, None],
-        torch.zeros(1, 1, dtype=torch.long),
-        1,
-        (CELLS, CELLS),
-        MapGeometry(STRIDE),
-    )
+    belief, field = encoded(keypoints[None], CELLS, STRIDE)
     centre = np.arange(CELLS) * STRIDE + (STRIDE - 1) / 2
     grid = np.stack(np.meshgrid(centre, centre), -1)
     for k in range(9):
-        if belief[0, k].any():
+        if belief[k].any():
             off = grid - keypoints[k]
             precision = np.linalg.inv(covariance[k] + STRIDE**2 * np.eye(2))
             drawn = np.exp(-0.5 * np.einsum("hwi,ij,hwj->hw", off, precision, off))
-            belief[0, k] = torch.tensor(drawn)
-    return belief[0], field[0]
+            belief[k] = torch.tensor(drawn)
+    return belief, field
 
 
 def reference(
@@ -199,16 +182,8 @@ def clean(seed: int, frames: int) -> None:
                 centres = rng.uniform(0, CELLS * STRIDE, (count, 2))
                 poses = [random_pose(rng, *c, rng.uniform(0.5, 1.5)) for c in centres]
                 points = np.array([project_keypoints(solid.cuboid, T, K) for T in poses])
-                maps = encode(
-                    torch.tensor(points)[None],
-                    torch.zeros(1, count, dtype=torch.long),
-                    1,
-                    (CELLS, CELLS),
-                    MapGeometry(STRIDE, sigma),
-                )
-                detections = recover(
-                    maps[0][0], maps[1][0], solid.cuboid[None], K, STRIDE, sigma=sigma
-                )
+                maps = encoded(points, CELLS, STRIDE, sigma)
+                detections = recover(*maps, solid.cuboid[None], K, STRIDE, sigma=sigma)
                 for truth in points:
                     if not detections:
                         continue

@@ -29,9 +29,7 @@ from dopepp.virtual import PRESETS, Factory
 
 SIZE = (640, 480)
 LEAST_VISIBLE = 0.5
-MEDIAN_NORM = 1.54
-"""Median length of a vector of three standard normal numbers."""
-
+MEDIAN_NORM = 1.54  # Median length of a vector of three standard normal numbers
 DEVIATIONS = np.repeat([math.radians(9.0), 0.005], 3) / MEDIAN_NORM
 WORSE_MM = 1.0
 

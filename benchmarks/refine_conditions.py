@@ -14,16 +14,12 @@ import argparse
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
 from common import pose_errors, print_head, print_row, use_one_thread
 
-from dopepp.core.files import write_png
 from dopepp.data.sample import Instance
-from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
-from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import Transform, crop_camera, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -38,8 +34,7 @@ from dopepp.virtual.scene import Grooves, Material
 from dopepp.virtual.sensor import capture
 
 SEED = 991
-CAD_ERROR = 0.0003
-"""Metres that are added to the mesh everywhere."""
+CAD_ERROR = 0.0003  # Metres that are added to the mesh everywhere
 
 
 def on_target(change: Callable[[Material], Material]) -> Callable[[Scene], Scene]:
@@ -141,9 +136,9 @@ def measure(
     part: Part,
     scenes: list[Scene],
     focal: float = 1.0,
-) -> tuple[list[str], list[Tile]]:
-    """Return a row, and drawn images: truth green, network blue, refined yellow."""
-    rows, tiles, kept = [], [], 0
+) -> list[str]:
+    """Return a row."""
+    rows, kept = [], 0
     for scene in scenes:
         image = capture(render(scene).image, scene.sensor)
         K = scene.K * np.array([[focal], [focal], [1.0]])
@@ -152,28 +147,16 @@ def measure(
             Instance(part.name, scene.objects[number].T_cam_obj, scene.keypoints(number))
             for number in scene.targets
         ]
-        frames = [Wireframe(instance.keypoints, GREEN, "true") for instance in shown]
         errors = np.full((2, len(shown), 2), np.inf)
-        for method, colour, of_method in zip(
-            (network, estimator), (BLUE, YELLOW), errors, strict=True
-        ):
+        for method, of_method in zip((network, estimator), errors, strict=True):
             detections = method.predict(image, K)
             for detection, number in zip(detections, assign(part, detections, shown), strict=True):
                 kept += bool(detection.kept)
-                frames.append(
-                    Wireframe(
-                        detection.keypoints, colour, "network" if colour == BLUE else "refined"
-                    )
-                )
                 if number >= 0:
                     true = shown[number].T_cam_obj
                     error = pose_errors(detection.T_cam_obj, true, part.points)
                     of_method[number] = error.rotation, error.add
         rows.append(errors)
-        title = ", ".join(
-            f"{before[1]:.1f} to {after[1]:.1f}" for before, after in zip(*errors, strict=True)
-        )
-        tiles.append(Tile(overlay(image, frames), f"{name}: {title}"))
     both = np.concatenate(rows, axis=1)
     is_found = np.isfinite(both[..., 1])
     twice = both[:, is_found.all(axis=0)]
@@ -183,7 +166,7 @@ def measure(
 
     worse = float(np.mean(twice[1, :, 1] > twice[0, :, 1] + 1)) if twice.size else 0.0
     limits = [1e3 * share * part.diameter for share in (0.1, 0.05)]
-    cells = [
+    return [
         name,
         pair((~is_found).mean(axis=1), ".0%"),
         *(pair((both[..., 1] < limit).mean(axis=1), ".0%") for limit in limits),
@@ -191,7 +174,6 @@ def measure(
         f"{worse:.0%}",
         f"{kept / both.shape[1]:.0%}",
     ]
-    return cells, tiles[:3]
 
 
 def main() -> None:
@@ -199,13 +181,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", default="pretrained/pivconnector")
     parser.add_argument("--images", type=int, default=60)
-    parser.add_argument("--preset", default="quickstart")
-    parser.add_argument("--pictures", type=Path, help="file for a sheet with three images per row")
     arguments = parser.parse_args()
     use_one_thread()
     estimator = PoseEstimator.load(arguments.checkpoint)
     part = load_part(estimator.parts[0].name)
-    preset = PRESETS[arguments.preset]
+    preset = PRESETS["quickstart"]
     usual = estimator.refining("region", [part])
 
     def scenes(size: tuple[int, int] | None = None) -> list[Scene]:
@@ -214,12 +194,9 @@ def main() -> None:
         return [factory.scene(0, index) for index in range(arguments.images)]
 
     print_head("fault", "missed", "ADD-0.1d", "ADD-0.05d", "°", "ADD mm", "worse by 1 mm", "kept")
-    sheet: list[Tile] = []
 
     def show(name: str, *given: object, **options: float) -> None:
-        row, tiles = measure(name, estimator, *given, **options)  # type: ignore[arg-type]
-        print_row(*row)
-        sheet.extend(tiles)
+        print_row(*measure(name, estimator, *given, **options))  # type: ignore[arg-type]
 
     plain = scenes()
     for name, change in SCENES.items():
@@ -231,8 +208,6 @@ def main() -> None:
         show(name, usual, part, [paired(scene, hidden, rng) for scene in plain])
     for size in SIZES:
         show(f"{size[0]}×{size[1]} pixels", usual, part, scenes(size))
-    if arguments.pictures is not None:
-        write_png(arguments.pictures, contact_sheet(sheet, 3))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Refinement on real frames of a BOP data set.
 
-    python benchmarks/refine_real.py FOLDER [--checkpoint CKPT] [--half even] [--pictures SHEET.png]
+    python benchmarks/refine_real.py FOLDER [--checkpoint CKPT] [--half even]
 
 Start poses are the detections of a network (``--checkpoint``). Without a network, they are drawn
 around the published poses: shifted by 10 mm and rotated by 5°, both in random directions. With
@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,13 +28,10 @@ import numpy as np
 import torch
 from common import pose_errors, print_head, print_row, random_step, timed
 
-from dopepp.core.files import write_png
 from dopepp.core.json import read_json
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
 from dopepp.data.sample import Instance
-from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import RGBImage, read_rgb
-from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -93,6 +90,12 @@ def read_frames(scene: Path, half: slice) -> Iterator[Frame]:
                 objects.append((annotation["obj_id"], T))
         pixels = read_rgb(next((scene / "rgb").glob(f"{int(image):06d}.*")))
         yield Frame(pixels, np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float), objects)
+
+
+def read_scenes(folder: Path, split: str, half: str = "both") -> Iterator[Frame]:
+    """Yield the frames of all scenes of a split; ``half`` is a key of :data:`HALVES`."""
+    for scene in sorted((folder / split).iterdir()):
+        yield from read_frames(scene, HALVES[half])
 
 
 class DrawnStarts:
@@ -201,11 +204,6 @@ def main() -> None:
         "--spread", type=float, default=1.0, help="factor on the errors of drawn starts"
     )
     parser.add_argument("--from-truth", action="store_true", help="start at the published poses")
-    parser.add_argument(
-        "--pictures",
-        type=Path,
-        help="file for a sheet of every 20th pose: truth green, start blue, refined yellow",
-    )
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     parts = parts_by_id(arguments.folder, bop_parts(arguments.folder))
@@ -215,14 +213,10 @@ def main() -> None:
         method = DrawnStarts(parts, arguments.scale_errors, spread, from_truth)
     else:
         method = NetworkStarts(parts, arguments.scale_errors, arguments.checkpoint)
-    scenes = sorted((arguments.folder / arguments.split).iterdir())
-    frames = chain.from_iterable(read_frames(scene, HALVES[arguments.half]) for scene in scenes)
+    frames = read_scenes(arguments.folder, arguments.split, arguments.half)
     starts = [(frame, *start) for frame in frames for start in method.starts(frame)]
     rows: dict[str, list[np.ndarray]] = {}
-    tiles: list[Tile] = []
-    for limit, (count, (frame, number, true, start)) in product(
-        arguments.scale_errors, enumerate(starts)
-    ):
+    for limit, (frame, number, true, start) in product(arguments.scale_errors, starts):
         part, given = parts[number], (frame, number, start, limit)
         pose, took = timed(lambda given=given: method.refine(*given))  # type: ignore[misc]
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
@@ -238,25 +232,12 @@ def main() -> None:
         row = np.array([*before, *after, *rest])
         for name in (part.name, "all"):
             rows.setdefault(f"{name}, scale {limit:g}", []).append(row)
-        if arguments.pictures is not None and count % 20 == 0:
-            wireframes = [
-                Wireframe(project_keypoints(part.cuboid, T, frame.K), colour, name)
-                for T, colour, name in (
-                    (true, GREEN, "true"),
-                    (pose.start, BLUE, "start"),
-                    (pose.end, YELLOW, "refined"),
-                )
-            ]
-            caption = f"{part.name}: {before[0]:.1f} to {after[0]:.1f} mm"
-            tiles.append(Tile(overlay(frame.image, wireframes), caption))
     print_head(
         "object", "poses", "ADD mm", "ADD-0.1d", "rotation °", "translation mm", "distance %",
         "MSPD px", "worse by 1 mm", "kept", "normalised error", "ms",
     )  # fmt: skip
     for name, poses in rows.items():
         print_row(*medians(name, poses))
-    if arguments.pictures is not None:
-        write_png(arguments.pictures, contact_sheet(tiles, 4))
 
 
 if __name__ == "__main__":

@@ -8,9 +8,6 @@ Times are CPU time of all threads, so other load affects them little. The stages
 - rasterise and shade: 2×2 anti-aliasing, shadows, and the labels depth, instances and visible
   fractions;
 - sensor: blur, noise and compression.
-
-The *painter* renders the same scenes for comparison, without the scene stage: OpenCV fills
-depth-sorted triangles with flat colours at twice the size, without shadows, textures and labels.
 """
 
 from __future__ import annotations
@@ -30,10 +27,10 @@ from common import print_head, print_row, timed
 from manifold3d import Manifold
 from manifold3d import Mesh as ManifoldMesh
 
-from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual import PRESETS, Factory, Preset, Scene, make_surface, render
+from dopepp.virtual import PRESETS, Factory, make_surface, render
+from dopepp.virtual.presets import Preset
 from dopepp.virtual.sensor import capture
 
 PRESET_NAMES = ("paper", "quickstart", "table", "bin")
@@ -42,8 +39,6 @@ NUM_DISTRACTORS = {"paper": (0, 4), "quickstart": (0, 4)}
 
 SIZES = ((640, 480), (416, 416))
 WARM_UP = 3
-PAINTED = 3
-"""Images of the painter, which is slow, and whose time varies little."""
 
 FIRST_IMAGE = """\
 import sys
@@ -69,35 +64,6 @@ def refined(part: Part, num_faces: int) -> Part:
     return make_part(part.name, Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
 
 
-def flat_triangles(scene: Scene, scale: float) -> list[np.ndarray]:
-    """Return pixels (N, 3, 2), depths (N, 3) and colours (N, 3) of the N front faces."""
-    K = resize_camera(scene.K, scale, scale)
-    towards = -np.array(scene.lights[0].position)
-    towards /= np.linalg.norm(towards)
-    parts = []
-    for item in scene.objects:
-        corners = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        front = ((normals * corners[:, 0]).sum(axis=1) < 0) & (corners[..., 2].min(axis=1) > 0.01)
-        corners, normals = corners[front], normals[front]
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        light = np.clip(-normals @ towards, 0, 1) * 0.7 + 0.2
-        colours = 255 * light[:, None] * np.array(item.material.colour)
-        parts.append((project(corners, K), corners[..., 2], colours))
-    return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-
-
-def painter(scene: Scene) -> np.ndarray:
-    """Fill triangles from far to near at twice the size, and reduce the image."""
-    width, height = scene.size
-    canvas = cv2.resize(scene.background, (2 * width, 2 * height), interpolation=cv2.INTER_NEAREST)
-    pixels, depths, colours = flat_triangles(scene, 2.0)
-    fixed = np.round(pixels * 16).astype(np.int32)
-    for number in np.argsort(-depths.mean(axis=1)):
-        cv2.fillConvexPoly(canvas, fixed[number], colours[number].tolist(), cv2.LINE_8, 4)
-    return np.asarray(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA))
-
-
 def preset_of(name: str, size: tuple[int, int]) -> Preset:
     """Return a preset with an image size and the benchmark's number of distractors."""
     preset = PRESETS[name].resized(*size)
@@ -110,21 +76,19 @@ def measure(part: Part, preset: Preset, num_images: int) -> list[str]:
     factory = Factory([part], preset, seed=0)
     for index in range(WARM_UP):
         factory.render(1, index)
-    times, painted = [], []
+    times = []
     for index in range(num_images):
         scene, scene_ms = timed(partial(factory.scene, 0, index))
         rendered, render_ms = timed(partial(render, scene))
         _, sensor_ms = timed(partial(capture, rendered.image, scene.sensor))
         times.append((scene_ms, render_ms, sensor_ms))
-        if index < PAINTED:
-            painted.append(timed(partial(painter, scene))[1])
     stages = np.array(times).T
     totals = stages.sum(axis=0)
     shares = stages.sum(axis=1) / stages.sum()
     low, high = preset.distractors.number
     labels = [preset.name, f"{preset.width}×{preset.height}", f"{low}–{high}" if high else "0"]
     spent = [f"{np.median(totals):.1f}", f"{totals.mean():.1f}"]
-    return [*labels, *spent, *(f"{share:.0%}" for share in shares), f"{np.mean(painted):.0f}"]
+    return [*labels, *spent, *(f"{share:.0%}" for share in shares)]
 
 
 def first_image() -> tuple[float, float]:
@@ -168,9 +132,7 @@ def main() -> None:
     part = refined(pivconnector(), arguments.faces)
     assert part.mesh is not None
     print(f"{part.name}, {len(part.mesh.faces):,} faces, CPU milliseconds per image")
-    headings = (
-        "preset, size, distractors, median, mean, scene, rasterise and shade, sensor, painter"
-    )
+    headings = "preset, size, distractors, median, mean, scene, rasterise and shade, sensor"
     presets = (preset_of(name, size) for name in PRESET_NAMES for size in SIZES)
     show(headings.split(", "), (measure(part, preset, arguments.images) for preset in presets))
     show(["preparing a surface, once per part", "CPU-ms"], bake_rows(part, WARM_UP))

@@ -1,6 +1,6 @@
 """CPU time per image of Mitsuba's variants and the rasteriser, and agreement of their labels.
 
-    python benchmarks/renderers.py [--images 6] [--size 640 480]
+    python benchmarks/renderers.py
 
 All renderers draw the same random scenes. Times are CPU time (all threads of the process) and wall
 time, without the first image, which compiles kernels. Depth agrees within 1 mm; masks agree if they
@@ -23,11 +23,13 @@ from common import print_head, print_row
 
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
-from dopepp.virtual import PRESETS, Factory, Rendered, Scene, render
+from dopepp.virtual import PRESETS, Factory, Scene, render
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.renderers.photoreal import VARIANT_SETTING, VARIANTS
+from dopepp.virtual.scene import Rendered
 
 SCENES = ("paper", "table")
+SIZE, NUM_IMAGES = (640, 480), 6
 LIMIT_M = 1e-3
 SEED = 11
 
@@ -43,12 +45,12 @@ def timed(
     return images, (time.process_time() - cpu) / count, (time.perf_counter() - wall) / count
 
 
-def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> list[str]:
+def compare(name: str, preset: str) -> list[str]:
     """Return one row of the table."""
     renderer = find_renderer("photoreal")
     parts = [make() for make in BUILTIN.values()]
-    factory = Factory(parts, PRESETS[preset].resized(*size), SEED)
-    scenes = [factory.scene(0, index) for index in range(num_images + 1)]
+    factory = Factory(parts, PRESETS[preset].resized(*SIZE), SEED)
+    scenes = [factory.scene(0, index) for index in range(NUM_IMAGES + 1)]
     expected, base, _ = timed(render, scenes)
     images, cpu, wall = timed(renderer, scenes)
     pairs = list(zip(images, expected, strict=True))
@@ -56,21 +58,19 @@ def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> l
     masks = [(image.instances == reference.instances).mean() for image, reference in pairs]
     times = f"{cpu:.3f}", f"{wall:.3f}", f"{1e3 * base:.1f}", f"{cpu / base:.0f}×"
     agreement = f"{100 * min(depth):.3f} %", f"{100 * min(masks):.3f} %"
-    return [name, preset, f"{size[0]}×{size[1]}", *times, *agreement]
+    return [name, preset, f"{SIZE[0]}×{SIZE[1]}", *times, *agreement]
 
 
 def main() -> None:
     """Print the table, or with ``--only`` the rows of one variant."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--images", type=int, default=6, help="images per row")
-    parser.add_argument("--size", type=int, nargs=2, default=(640, 480), help="width and height")
     parser.add_argument("--only", choices=VARIANTS, help="this variant's rows, without a header")
     arguments = parser.parse_args()
     if arguments.only is not None:
         cv2.setNumThreads(1)
         try:
             for preset in SCENES:
-                print_row(*compare(arguments.only, preset, arguments.size, arguments.images))
+                print_row(*compare(arguments.only, preset))
         except UserError as error:
             print(f"{arguments.only}: not measured: {error}")
         return
@@ -80,8 +80,7 @@ def main() -> None:
     )  # fmt: skip
     for name in VARIANTS:
         settings = {"OMP_NUM_THREADS": "1", VARIANT_SETTING: name}
-        command = [sys.executable, __file__, "--only", name, "--images", str(arguments.images)]
-        command += ["--size", *map(str, arguments.size)]
+        command = [sys.executable, __file__, "--only", name]
         subprocess.run(command, env={**os.environ, **settings}, check=True)
 
 

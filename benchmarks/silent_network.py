@@ -1,6 +1,6 @@
 """Correct and wrong poses of templates on images without a detection of the network.
 
-    python benchmarks/silent_network.py FOLDER --checkpoint pretrained/pivconnector_wide
+    python benchmarks/silent_network.py FOLDER
 
 FOLDER is a BOP data set with one part, as ``dopepp render`` writes it. The network's poses are
 refined and must pass its threshold. On images without such a pose, templates of the same part
@@ -10,11 +10,10 @@ search the distances of the data set.
 from __future__ import annotations
 
 import argparse
-from itertools import chain
 from pathlib import Path
 
 from common import pose_errors, print_head, print_row, use_one_thread
-from refine_real import HALVES, read_frames
+from refine_real import read_scenes
 
 from dopepp.geometry.camera import Transform
 from dopepp.inference.estimator import PoseEstimator
@@ -39,14 +38,11 @@ def main() -> None:
     """Print the numbers of correct and wrong poses of the network and of the templates."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--checkpoint", default="pretrained/pivconnector_wide")
-    parser.add_argument("--split", default="train_pbr")
     arguments = parser.parse_args()
     use_one_thread()
-    network = PoseEstimator.load(arguments.checkpoint, refine="region")
+    network = PoseEstimator.load("pretrained/pivconnector_wide", refine="region")
     (part,) = network.parts
-    scenes = sorted((arguments.folder / arguments.split).iterdir())
-    frames = list(chain.from_iterable(read_frames(scene, HALVES["both"]) for scene in scenes))
+    frames = list(read_scenes(arguments.folder, "train_pbr"))
     depths = [float(T[2, 3]) for frame in frames for _, T in frame.objects]
     templates = TemplateEstimator.of_parts([part], (min(depths) / SLACK, max(depths) * SLACK))
     print_head("method", "images", "right", "wrong")

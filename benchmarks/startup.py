@@ -1,11 +1,10 @@
 """Time of a command until its first output and until its end, relative to importing PyTorch.
 
-python benchmarks/startup.py --repeat 3
+python benchmarks/startup.py
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).parents[1]
+ROOT, REPEAT = Path(__file__).parents[1], 3
 DOPEPP = [
     sys.executable,
     "-c",
@@ -62,9 +61,6 @@ def imports(code: str, folder: Path) -> dict[str, float]:
 
 def main() -> None:
     """Print a row per command, then the packages with the longest imports of a prediction."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeat", type=int, default=3)
-    repeat = parser.parse_args().repeat
     folder = Path(tempfile.mkdtemp())
     os.environ["PYTHONPATH"] = str(ROOT)
     render = ["render", "pivconnector", "--preset", "quickstart", "-n", "1", "--out", "data"]
@@ -81,7 +77,7 @@ def main() -> None:
     torch_s = 0.0
     print(f"{'':34}first line s    end s    CPU s   CPU / import torch")
     for name, (command, until_first) in commands.items():
-        runs = [start(command, folder, until_first) for _ in range(repeat)]
+        runs = [start(command, folder, until_first) for _ in range(REPEAT)]
         first, end, cpu = (min(values) for values in zip(*runs, strict=True))
         torch_s = torch_s or cpu
         print(f"{name:34}{first:12.2f}{end:9.2f}{cpu:9.2f}{cpu / torch_s:12.2f}")

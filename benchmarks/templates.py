@@ -2,21 +2,21 @@
 
     python benchmarks/templates.py FOLDER --distances 0.12,0.25 [--tilt 60] [--images 40]
 
-FOLDER is a BOP data set, as ``dopepp render`` writes it. Its object ``--object`` is searched in
-each image. An image counts as correct if the best pose has an ADD below a tenth of the diameter
-from any annotated pose, or from a pose that a symmetry of the part maps to it. The level of false
-detections is not measured, because it does not change the order of the poses.
+FOLDER is a BOP data set with one part, as ``dopepp render`` writes it. An image counts as correct
+if the best pose has an ADD below a tenth of the diameter from any annotated pose, or from a pose
+that a symmetry of the part maps to it. The level of false detections is not measured, because it
+does not change the order of the poses.
 """
 
 from __future__ import annotations
 
 import argparse
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from common import pose_errors, print_head, print_row, timed, use_one_thread
-from refine_real import HALVES, Frame, read_frames
+from refine_real import Frame, read_scenes
 
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
@@ -51,22 +51,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--distances", required=True, help="nearest,farthest depth, metres")
     parser.add_argument("--tilt", type=float, default=180.0)
-    parser.add_argument("--split", default="train_pbr")
-    parser.add_argument("--object", type=int, default=1)
     parser.add_argument("--images", type=int, default=None, help="number of images (default: all)")
     arguments = parser.parse_args()
     use_one_thread()
     near, far = (float(distance) for distance in arguments.distances.split(","))
-    model = arguments.folder / "models" / f"obj_{arguments.object:06d}.ply"
+    model = arguments.folder / "models" / "obj_000001.ply"
     part = load_solid_part(model, "mm", None, "auto")
     detector = TemplateDetector(part, (near, far), arguments.tilt)
     estimator = TemplateEstimator([detector], (near, far))
-    scenes = sorted((arguments.folder / arguments.split).iterdir())
-    read = chain.from_iterable(read_frames(scene, HALVES["both"]) for scene in scenes)
-    frames = [
-        frame._replace(objects=[it for it in frame.objects if it[0] == arguments.object])
-        for frame in islice(read, arguments.images)
-    ]
+    frames = list(islice(read_scenes(arguments.folder, "train_pbr"), arguments.images))
     measure(estimator, frames[:1])  # compiles
     add, rotation, spent = np.array(measure(estimator, frames)).T
     correct = add < PASSING[0]

@@ -1,7 +1,6 @@
 """Tracking on rendered sequences: accuracy, noise at rest, frames to recover, frames per second.
 
-    python benchmarks/track.py [--checkpoint NAME] [--seeds 3] [--first 0] [--pictures FOLDER]
-                               [--views 2 [--perturbed]]
+    python benchmarks/track.py [--seeds 3] [--first 0] [--views 2 [--perturbed]]
 
 The part rests, is rotated (up to 8° per frame) and shifted (up to 5 % of its distance per frame),
 passes behind a hand-sized occluder, is covered completely for 15 frames, and rests again, while the
@@ -20,20 +19,16 @@ from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import trimesh
 from common import pose_errors, print_head, print_row, timed, use_one_thread
 from views import CAMERA_ERROR, perturbed
 
-from dopepp.core.files import write_png
-from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
 from dopepp.geometry.camera import (
     invert_transform,
     make_transform,
     orbited_camera,
-    project_keypoints,
     step_between,
 )
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
@@ -47,16 +42,11 @@ from dopepp.virtual.scene import Light, Material
 from dopepp.virtual.sensor import capture
 
 SIZE = (640, 480)
-REST = 60
-"""Number of frames at each end without motion."""
-
+REST = 60  # Number of frames at each end without motion
 COVERED = range(190, 205)
 PASSING = range(110, 160)
-WITHIN = (5.0, 2.0)
-"""Largest errors of a correct pose, millimetres and degrees."""
-
-LEAST_VISIBLE = 0.3
-"""Visible share of the part from which a frame is evaluated."""
+WITHIN = (5.0, 2.0)  # Largest errors of a correct pose, millimetres and degrees
+LEAST_VISIBLE = 0.3  # Visible share of the part from which a frame is evaluated
 
 
 @dataclass(frozen=True)
@@ -134,9 +124,7 @@ def is_right(pose: np.ndarray | None, true: np.ndarray, part: Part) -> bool:
     return errors.translation <= WITHIN[0] and errors.rotation <= WITHIN[1]
 
 
-def measure(
-    estimator: PoseEstimator, part: Part, seed: int, frames: int, images: Path | None
-) -> list[str]:
+def measure(estimator: PoseEstimator, part: Part, seed: int, frames: int) -> list[str]:
     """Return one row of the table."""
     tracker = PoseTracker(estimator)
     right: list[bool] = []
@@ -154,13 +142,6 @@ def measure(
             resting.append(pose)
         if recovery is None and number >= COVERED.stop and good:
             recovery = number - COVERED.stop + 1
-        if images is not None and (number % 10 == 0 or not good):
-            true = Wireframe(project_keypoints(part.cuboid, frame.T, frame.K), GREEN, "true")
-            estimates = [
-                Wireframe(track.detection.keypoints, YELLOW, f"{track.identity}")
-                for track in tracks
-            ]
-            write_png(images / f"{seed}_{number:03d}.png", overlay(frame.image, [true, *estimates]))
     # Differences between frames over √2, so that a slow drift does not count as noise.
     shifts = [
         float(np.linalg.norm(after[:3, 3] - before[:3, 3])) for before, after in pairwise(resting)
@@ -230,16 +211,14 @@ def _noise(steps: list[float]) -> float:
 def main() -> None:
     """Print a row per seed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--checkpoint", default="pretrained/pivconnector_wide")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--pictures", type=Path, help="folder for drawn frames")
     parser.add_argument("--views", type=int, default=1, help="number of cameras")
     parser.add_argument("--perturbed", action="store_true", help="errors of the camera poses")
     arguments = parser.parse_args()
     use_one_thread()
-    estimator = PoseEstimator.load(arguments.checkpoint)
+    estimator = PoseEstimator.load("pretrained/pivconnector_wide")
     part = load_part(estimator.parts[0].name)
     estimator = estimator.refining("region", [part])
     seeds = range(arguments.first, arguments.first + arguments.seeds)
@@ -255,7 +234,7 @@ def main() -> None:
         "ms p50", "p95",
     )  # fmt: skip
     for seed in seeds:
-        print_row(*measure(estimator, part, seed, arguments.frames, arguments.pictures))
+        print_row(*measure(estimator, part, seed, arguments.frames))
 
 
 if __name__ == "__main__":

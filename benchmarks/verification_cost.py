@@ -22,7 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from common import print_head, print_row, timed
-from refine_real import read_frames
+from refine_real import read_scenes
 
 from dopepp.data.formats.bop.bop_models import bop_parts, parts_by_id
 from dopepp.drawing.pictures import RGBImage
@@ -43,10 +43,9 @@ Case = tuple[str, Part, RGBImage, CameraMatrix, Transform]
 def real_cases(folder: Path) -> Iterator[Case]:
     """Yield the annotated poses of a BOP data set."""
     parts = parts_by_id(folder, bop_parts(folder))
-    for scene in sorted((folder / "test").iterdir()):
-        for frame in read_frames(scene, slice(None)):
-            for number, T in frame.objects:
-                yield f"{folder.name}: {parts[number].name}", parts[number], *frame[:2], T
+    for frame in read_scenes(folder, "test"):
+        for number, T in frame.objects:
+            yield f"{folder.name}: {parts[number].name}", parts[number], *frame[:2], T
 
 
 def rendered_cases(name: str) -> Iterator[Case]:

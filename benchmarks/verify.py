@@ -1,6 +1,6 @@
 """Rank correlation between the agreement score and the true error of perturbed poses, on renders.
 
-    python benchmarks/verify.py [--images 40] [--seed 61] [--parts servoholder pivconnector FILE …]
+    python benchmarks/verify.py [--images 40] [--parts servoholder pivconnector FILE …]
 
 Poses are shifted by up to 20 mm and rotated by up to 20° from the true pose (both uniform, in
 random directions). The table has Spearman's rank correlation of agreement and ADD over all poses of
@@ -25,6 +25,8 @@ from dopepp.virtual.agreement import agreement
 
 SHIFT_M, TURN_DEG = 0.02, 20.0
 LEAST_VISIBLE = 0.3
+SEED, NUM_POSES = 61, 12  # the first pose of a target is the true pose
+PRESET_NAMES = ("paper", "table", "bin", "quickstart")
 
 
 def perturbed(T: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
@@ -35,25 +37,23 @@ def perturbed(T: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarr
     return make_transform(rotation_vector_to_matrix(axis) @ T[:3, :3], T[:3, 3] + shift)
 
 
-def measure(
-    name: str, preset: str, num_images: int, poses: int, seed: int, unit: str
-) -> tuple[float, float, float, float, float]:
+def measure(name: str, preset: str, num_images: int) -> tuple[float, float, float, float, float]:
     """Return the row of a part and preset.
 
     The numbers are the rank correlation over all poses, its median over targets, the median
     agreement of true poses and of poses with an ADD above 15 mm, and milliseconds per pose.
     """
-    part = load_part(name, unit)
-    factory = Factory([part], PRESETS[preset], seed)
+    part = load_part(name, "mm")
+    factory = Factory([part], PRESETS[preset], SEED)
     rows, single, took = [], [], []
     for index in range(num_images):
         rendered = factory.render(0, index)
-        rng = np.random.default_rng([seed, index])
+        rng = np.random.default_rng([SEED, index])
         for number in rendered.scene.targets:
             if rendered.visible_fractions[number] < LEAST_VISIBLE:
                 continue
             item, pairs = rendered.scene.objects[number], []
-            for pose in range(poses):
+            for pose in range(NUM_POSES):
                 T = perturbed(item.T_cam_obj, rng, min(1.0, float(pose)))
                 given = rendered.image, rendered.scene.K, T, item.surface
                 value, milliseconds = timed(lambda given=given: agreement(*given))
@@ -76,19 +76,15 @@ def main() -> None:
     """Print a row per part and preset."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", type=int, default=40, help="images per part and preset")
-    parser.add_argument("--poses", type=int, default=12, help="per target; the first is true")
-    parser.add_argument("--seed", type=int, default=61)
-    parser.add_argument("--presets", nargs="+", default=["paper", "table", "bin", "quickstart"])
     parser.add_argument("--parts", nargs="+", default=["servoholder", "pivconnector"])
-    parser.add_argument("--unit", default="mm", help="unit of mesh files")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     print_head(
         "part", "preset", "rank correlation", "median of images", "true pose", "> 15 mm off", "ms"
     )
     for name in options.parts:
-        for preset in options.presets:
-            row = measure(name, preset, options.images, options.poses, options.seed, options.unit)
+        for preset in PRESET_NAMES:
+            row = measure(name, preset, options.images)
             print_row(name.rsplit("/", 1)[-1], preset, *(f"{value:.2f}" for value in row))
 
 

@@ -108,7 +108,6 @@ def main() -> None:
     parser.add_argument("--perturbed", action="store_true")
     parser.add_argument("--checkpoint", default="pretrained/pivconnector_wide")
     parser.add_argument("--preset", default="wide")
-    parser.add_argument("--verbose", action="store_true", help="print the scenes that fail")
     options = parser.parse_args()
     use_one_thread()
     estimator = PoseEstimator.load(options.checkpoint, refine="region")
@@ -141,9 +140,6 @@ def main() -> None:
                 wrong[count] += errors[0] >= PASSING
                 row = min(row, (*errors, surprise)) if errors[0] < PASSING else row
             rows[count].append(row)
-            if options.verbose and (not math.isfinite(row[0]) or result.findings):
-                scores = [(it.score, it.views) for it in (*result.detections, *result.weaker)]
-                print(index, count, row, scores, result.findings)
     print_head(
         "views", "scenes", "along mm, 50 % (90 %)", "across mm", "rotation °", "missed", "wrong",
         "normalised error", "ms",

@@ -1,12 +1,12 @@
 """Several views of a static scene compared with one view, on real frames of a BOP data set.
 
-    python benchmarks/views_real.py FOLDER [--checkpoint CKPT] [--frames 4] [--angles 20 40]
+    python benchmarks/views_real.py FOLDER [--stride 4] [--spread 3]
 
 The relative poses of the cameras come from aligning the cuboids of all other objects at their
 published poses. LM-O's objects were moved several times, so only frames are combined in which all
-other objects agree within 8 mm. The evaluated object may still have been moved. Without a network,
-detections are drawn around the published poses, 5° and 10 mm off (times ``--spread``), in each
-frame independently. The table has ADD(-S)-0.1d of objects that are at least a tenth visible in the
+other objects agree within 8 mm. The evaluated object may still have been moved. Detections are
+drawn around the published poses, 5° and 10 mm off (times ``--spread``), in each frame
+independently. The table has ADD(-S)-0.1d of objects that are at least a tenth visible in the
 first frame, refined on this frame and on all frames.
 """
 
@@ -42,6 +42,7 @@ from dopepp.recovery.detection import Detection, RecoveryOptions, recalibrate
 SYMMETRIC = (10, 11)  # eggbox and glue of LINEMOD, by a half turn about z
 LEAST_VISIBLE = 0.1
 FEWEST_OTHERS, STATIC = 4, 0.008
+SCENE, NUM_FRAMES, ANGLES = "test/000002", 4, (20.0, 40.0)  # degrees between the frames
 CAMERA_ERROR = (2e-3, math.radians(0.2))
 
 
@@ -86,15 +87,13 @@ class Frames:
         R = nearest_rotation(spread)
         return make_transform(R, to.mean(axis=0) - R @ points.mean(axis=0))
 
-    def partners(
-        self, first: str, left_out: int, parts: dict[int, Part], angles: tuple[float, float]
-    ) -> list[str]:
-        """Return the frames of the same scene whose viewing direction differs by given angles."""
+    def partners(self, first: str, left_out: int, parts: dict[int, Part]) -> list[str]:
+        """Return the frames of the same scene whose viewing direction differs by ``ANGLES``."""
         frames = []
         for other in self.poses:
             T = self.relative(first, other, left_out, parts)
             turn = math.degrees(math.acos(np.clip(T[2, 2], -1.0, 1.0)))
-            if other == first or not angles[0] <= turn <= angles[1]:
+            if other == first or not ANGLES[0] <= turn <= ANGLES[1]:
                 continue
             apart = [
                 np.abs(
@@ -149,47 +148,34 @@ def main() -> None:
     """Print a row per object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--scene", default="test/000002")
-    parser.add_argument("--checkpoint", help="network of some of the objects (default: drawn)")
-    parser.add_argument("--frames", type=int, default=4, help="frames of each scene")
-    parser.add_argument("--angles", type=float, nargs=2, default=[20.0, 40.0], help="degrees")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th frame as the first")
     parser.add_argument("--spread", type=float, default=1.0, help="factor on the drawn errors")
     options = parser.parse_args()
     use_one_thread()
     parts = parts_by_id(options.folder, bop_parts(options.folder))
     parts = {n: with_half_turn(part) if n in SYMMETRIC else part for n, part in parts.items()}
-    frames, rng = Frames(options.folder / options.scene), np.random.default_rng(SEED)
+    frames, rng = Frames(options.folder / SCENE), np.random.default_rng(SEED)
     names = list(frames.poses)
-    network = None
-    if options.checkpoint is not None:
-        solid = list(parts.values())
-        known = {part.name for part in PoseEstimator.load(options.checkpoint).parts}
-        solid = [part for part in solid if part.name in known]
-        network = PoseEstimator.load(options.checkpoint, refine="region", parts=solid)
     print_head("object", "frames", "one frame", "several", "supporting views")
     total = np.zeros(2)
     count = 0
     for number, part in parts.items():
-        if network is not None and part.name not in {it.name for it in network.solid_parts}:
-            continue
-        estimator = network or DrawnEstimator(part, options.spread)
+        estimator = DrawnEstimator(part, options.spread)
         rows, shown = [], []
         for first in names[:: options.stride]:
             if number not in frames.visible[first]:
                 continue
-            near = frames.partners(first, number, parts, tuple(options.angles))
-            if len(near) < options.frames - 1:
+            near = frames.partners(first, number, parts)
+            if len(near) < NUM_FRAMES - 1:
                 continue
-            chosen = [first, *rng.permutation(near)[: options.frames - 1].tolist()]
+            chosen = [first, *rng.permutation(near)[: NUM_FRAMES - 1].tolist()]
             images = [frames.image(name) for name in chosen]
-            if isinstance(estimator, DrawnEstimator):
-                estimator.starts.clear()
-                for name, image in zip(chosen, images, strict=True):
-                    if number in frames.visible[name]:
-                        step = random_step(rng, options.spread * TURN, options.spread * SHIFT)
-                        pose = move_pose(frames.poses[name][number], step)
-                        estimator.starts[image.tobytes()] = pose
+            estimator.starts.clear()
+            for name, image in zip(chosen, images, strict=True):
+                if number in frames.visible[name]:
+                    step = random_step(rng, options.spread * TURN, options.spread * SHIFT)
+                    pose = move_pose(frames.poses[name][number], step)
+                    estimator.starts[image.tobytes()] = pose
             cameras = [frames.K[name] for name in chosen]
             poses = [frames.relative(first, name, number, parts) for name in chosen]
             true, results = frames.poses[first][number], []

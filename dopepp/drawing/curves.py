@@ -20,11 +20,8 @@ from matplotlib.figure import Figure
 from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.pictures import RGBImage
 
-MAX_THRESHOLD: Final = 0.1
-"""Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)."""
-
-_NUM_STEPS: Final = 200
-"""Number of steps of a curve, 0.5 mm each up to 0.1 m."""
+MAX_THRESHOLD: Final = 0.1  # Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)
+_NUM_STEPS: Final = 200  # of a curve, 0.5 mm each
 
 _SMOOTHING: Final = 50
 """Lines with more points are drawn pale, below their moving average over 1/50 of the points."""
@@ -52,10 +49,8 @@ def accuracy_figure(
 ) -> Figure:
     """Draw accuracy-threshold curves of several methods, with their exact AUC in the legend.
 
-    Args:
-        curves: Pose error of each instance by method, metres; infinite for a miss.
-        title: Title of the figure.
-        colours: Matplotlib colours by method (default: matplotlib's cycle).
+    ``curves`` are the pose errors of each instance by method, metres; infinite for a miss.
+    ``colours`` are Matplotlib's by default.
     """
     figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():
@@ -70,9 +65,7 @@ def accuracy_figure(
 
 
 def save_accuracy_curves(
-    path: Path | str,
-    curves: Mapping[str, Float[np.ndarray, "n"]],
-    title: str = "",
+    path: Path | str, curves: Mapping[str, Float[np.ndarray, "n"]], title: str = ""
 ) -> Figure:
     """Write :func:`accuracy_figure`'s curves to ``<path>.png`` and ``.csv``; return the figure.
 
@@ -139,12 +132,9 @@ def rates_figure(
 ) -> Figure:
     """Draw panels row by row, with a line and a confidence band for each method.
 
-    Args:
-        panels: Curves by title of the panel and name of the method.
-        x_label: Label of the x axes: the quantity with its unit.
-        columns: Number of panels per row.
-        edges: Values of x to mark by vertical lines, e.g. limits of bins.
-        ratio: Whether the x axis is logarithmic, with ticks at the curves' values of x.
+    ``panels`` has the curves by title of the panel and name of the method. Vertical lines mark the
+    ``edges``, values of x. With ``ratio``, the x axis is logarithmic, with ticks at the curves'
+    values of x.
     """
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")

@@ -20,21 +20,14 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
-Colour = tuple[int, int, int]
-"""Red, green and blue, 0 to 255."""
+Colour = tuple[int, int, int]  # Red, green and blue, 0 to 255
 
 YELLOW: Final[Colour] = (255, 221, 0)
 """Colour of predictions, or of DOPE++ in a comparison of two networks (paper Fig. 14)."""
 
-GREEN: Final[Colour] = (40, 220, 60)
-"""Colour of the ground truth."""
-
-BLUE: Final[Colour] = (70, 165, 255)
-"""Colour of the DOPE baseline (paper Fig. 14)."""
-
-WHITE: Final[Colour] = (255, 255, 255)
-"""Colour of captions."""
-
+GREEN: Final[Colour] = (40, 220, 60)  # Colour of the ground truth
+BLUE: Final[Colour] = (70, 165, 255)  # Colour of the DOPE baseline (paper Fig. 14)
+WHITE: Final[Colour] = (255, 255, 255)  # Colour of captions
 MIN_WIDTH_PX: Final = 640  # narrower images are enlarged, for readable lines and legends
 
 _FRACTION_BITS: Final = 4  # sub-pixel coordinates of cv2 are integers, here in 1/16 pixel
@@ -46,12 +39,9 @@ _FRONT_TOP: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [1, 1]).all(axi
 
 @dataclass(frozen=True)
 class Wireframe:
-    """A projected cuboid to draw.
+    """A projected cuboid to draw."""
 
-    Attributes:
-        keypoints: Eight corners in NDDS order and the centroid, pixels; NaN if missing.
-    """
-
+    # Eight corners in NDDS order and the centroid, pixels; NaN if missing.
     keypoints: Float[np.ndarray, "9 2"]
     colour: Colour = YELLOW
     label: str = ""
@@ -87,12 +77,9 @@ def draw_wireframe(
 ) -> RGBImage:
     """Draw the edges of a projected cuboid, anti-aliased, on a copy of the image.
 
-    Args:
-        image: Image to copy.
-        keypoints: Eight corners in NDDS order and the centroid, pixels; edges with a keypoint that
-            is not finite are left out.
-        colour: Colour of the +z face; other edges are darker.
-        thickness: Width of the back edges, pixels; edges of the +z face are one pixel wider.
+    ``keypoints`` are eight corners in NDDS order and the centroid, pixels; edges with a keypoint
+    that is not finite are left out. Edges of the +z face are a pixel wider than ``thickness`` and
+    brighter than the others.
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)
@@ -161,11 +148,7 @@ def _clip(
 
 
 def draw_text(
-    image: RGBImage,
-    text: str,
-    position: tuple[int, int],
-    size_px: int,
-    colour: tuple[int, int, int],
+    image: RGBImage, text: str, position: tuple[int, int], size_px: int, colour: Colour
 ) -> None:
     """Draw a line of text in place on a darkened box, cut off at the image border.
 

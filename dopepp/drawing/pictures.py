@@ -29,14 +29,11 @@ from dopepp.core.files import partial_path, read_limited
 # OpenCV reads this once, before its first video: FFmpeg must not write to the terminal.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
-RGBImage = UInt8[np.ndarray, "height width 3"]
-"""RGB image, 8 bits per channel, first row on top."""
+RGBImage = UInt8[np.ndarray, "height width 3"]  # RGB image, 8 bits per channel, first row on top
 
-Size = tuple[int, int]
-"""(width, height), pixels."""
+Size = tuple[int, int]  # (width, height), pixels
 
-Shape = tuple[int, int]
-"""(height, width) of an image array, pixels."""
+Shape = tuple[int, int]  # (height, width) of an image array, pixels
 
 Mask = Bool[np.ndarray, "height width"]
 
@@ -46,8 +43,7 @@ DepthMap = Float[np.ndarray, "height width"]
 FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
 """Accepted raster formats by Pillow's names; for EPS, Pillow would start another program."""
 
-FRAME_FORMATS: Final = ("PNG", "JPEG")
-"""Formats of the frames of YCB-Video, NDDS and FAT data sets."""
+FRAME_FORMATS: Final = ("PNG", "JPEG")  # Formats of the frames of YCB-Video, NDDS and FAT data sets
 
 MAX_SIDE: Final = 8192
 """Longest side of a picture, pixels: 0.2 GB in memory. A small file can declare any size."""
@@ -78,10 +74,8 @@ _JPEG_END: Final = b"\xff\xd9"
 def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
     """Read an image in one of :data:`FORMATS` as RGB.
 
-    Args:
-        path: File, with any suffix.
-        longest_px: Maximum of the longer side, pixels. Larger images are downscaled; a JPEG is
-            then decoded at a reduced size, which is faster.
+    Images with a side above ``longest_px`` are downscaled; a JPEG is then decoded at a reduced
+    size, which is faster.
 
     Raises:
         ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
@@ -271,9 +265,7 @@ class VideoFile(AbstractContextManager["VideoFile"]):
     Images are repeated or dropped to match their times, and resized to the first image's size.
     Odd sides are padded by one pixel, as the format requires even sides.
 
-    Args:
-        path: Path of the video, with the suffix ``.mp4``.
-        rate: Frames per second.
+    The suffix is ``.mp4``; ``rate`` is in frames per second.
     """
 
     def __init__(self, path: Path, rate: float) -> None:

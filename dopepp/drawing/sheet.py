@@ -171,7 +171,7 @@ def depth_panel(depth: DepthMap, shown: Mask) -> tuple[RGBImage, str]:
     return np.asarray(panel, np.uint8), f"depth: red {near:.3f} m to blue {far:.3f} m"
 
 
-def draw_axes(image: RGBImage, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
+def draw_axes(image: RGBImage, ends: Float[np.ndarray, "4 2"]) -> None:
     """Draw an object frame's axes on the image, in place.
 
     ``ends`` are the projections of the origin and of the tips of x, y and z, pixels. An axis with
@@ -180,4 +180,4 @@ def draw_axes(image: RGBImage, ends: Float[np.ndarray, "4 2"], thickness: int = 
     bound = 10 * max(image.shape)
     for tip, colour in zip(ends[1:], AXIS_COLOURS, strict=True):
         if (np.abs([ends[0], tip]) < bound).all():
-            draw_line(image, ends[0], tip, colour, thickness)
+            draw_line(image, ends[0], tip, colour, 2)

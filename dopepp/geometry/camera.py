@@ -19,11 +19,9 @@ from dopepp.geometry.rotation import (
     rotation_vector_to_matrix,
 )
 
-Transform = Float[np.ndarray, "4 4"]
-"""Rigid transform ``T_a_b`` from frame b into frame a, metres."""
+Transform = Float[np.ndarray, "4 4"]  # Rigid transform ``T_a_b`` from frame b into frame a, metres
 
-CameraMatrix = Float[np.ndarray, "3 3"]
-"""K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
+CameraMatrix = Float[np.ndarray, "3 3"]  # K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels
 
 Step = Float[np.ndarray, "6"]
 """Rotation vector about the object's origin (radians) and shift (metres), in camera axes."""
@@ -59,8 +57,7 @@ def move_pose(T_cam_obj: Transform, step: Step) -> Transform:
 def rotation_lever(offset: Vector) -> Float[np.ndarray, "6 6"]:
     """Return the matrix from a rotation about a point, with a shift, to the step of a pose.
 
-    Args:
-        offset: Object's origin relative to the point, camera axes, metres.
+    ``offset`` is the object's origin relative to the point, camera axes, metres.
     """
     x, y, z = offset
     lever = np.eye(6)
@@ -71,10 +68,9 @@ def rotation_lever(offset: Vector) -> Float[np.ndarray, "6 6"]:
 def orbited_camera(point: Vector, angle: float, direction: float) -> Transform:
     """Return T_new_cam, from a camera's frame to its frame after an orbit around a point.
 
-    Args:
-        point: Centre of the orbit in the camera's original frame, metres.
-        angle: Angle between the two lines of sight to the point, radians.
-        direction: Angle of the rotation axis from x in the image plane, radians.
+    ``point`` is the centre of the orbit in the original frame, metres; ``angle`` lies between the
+    two lines of sight to the point, and ``direction`` from x in the image plane to the rotation
+    axis, radians.
     """
     axis = np.array([math.cos(direction), math.sin(direction), 0.0])
     R = rotation_vector_to_matrix(angle * axis)
@@ -141,14 +137,8 @@ def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
 class Letterbox:
     """Resizing of an image to fit into a network's input, before padding.
 
-    Padding on the right and at the bottom leaves K unchanged. The scales of the two axes differ by
-    the rounding to whole pixels.
-
-    Attributes:
-        width: Width of the resized image, pixels.
-        height: Height of the resized image, pixels.
-        scale_x: Width of the resized image over the original width.
-        scale_y: Height of the resized image over the original height.
+    Padding on the right and at the bottom leaves K unchanged. The scales of the two axes (new over
+    old size) differ by the rounding to whole pixels.
     """
 
     width: int

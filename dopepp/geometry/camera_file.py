@@ -35,8 +35,7 @@ from dopepp.geometry.camera_formats import (
     parse_calibration,
 )
 
-Crop = tuple[int, int, int, int]
-"""x and y of the upper left pixel, width and height, pixels."""
+Crop = tuple[int, int, int, int]  # x and y of the upper left pixel, width and height, pixels
 
 MAX_BYTES: Final = 250_000
 """Largest size of a camera file, more than any calibration; parsing as much YAML takes 10 s."""
@@ -78,10 +77,8 @@ class Camera:
     ) -> Camera:
         """Return the camera of an image, after checking K against the image's size.
 
-        Args:
-            size: (width, height) of the image, pixels.
-            K_size: (width, height) of the calibrated image, if this image was resized.
-            crop: Region (x, y, width, height) of the calibrated image, if this image is a crop.
+        ``K_size`` is the size of the calibrated image if this image was resized, and ``crop`` the
+        region of the calibrated image if this image is a crop.
 
         Raises:
             UserError: K belongs to another size, which neither ``K_size`` nor ``crop`` explains, or

@@ -22,8 +22,7 @@ from dopepp.core.validation import Range, check, short_repr
 from dopepp.core.yaml import parse_yaml
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, pinhole_matrix
 
-Size = tuple[int, int]
-"""(width, height), pixels."""
+Size = tuple[int, int]  # (width, height), pixels
 
 FORMATS: Final = (
     "ROS camera_info, OpenCV FileStorage, BOP camera.json, COLMAP cameras.txt, "
@@ -131,9 +130,7 @@ def _words(element: ElementTree.Element) -> object:
 def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibration:
     """Return the calibration in the named fields of a file or a ROS message.
 
-    Args:
-        content: Fields by name, regardless of capitals and underscores.
-        source: Origin of the fields, for messages.
+    Capitals and underscores of the names do not matter.
 
     Raises:
         UserError: The camera matrix is missing, the lens is not OpenCV's pinhole model, or a field

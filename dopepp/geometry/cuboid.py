@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from dopepp.geometry.rotation import Vector
 
-Cuboid = Float[np.ndarray, "9 3"]
-"""The nine keypoints of an object, metres, object frame."""
+Cuboid = Float[np.ndarray, "9 3"]  # The nine keypoints of an object, metres, object frame
 
 NUM_CORNERS: Final = 8
 NUM_KEYPOINTS: Final = 9

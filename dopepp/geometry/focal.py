@@ -25,16 +25,11 @@ LENGTHS: Final = (0.5, 1.0, 2.0)  # Initial factors; each search covers half to 
 
 
 class Focal(NamedTuple):
-    """Correction of the focal lengths of a camera matrix.
+    """Correction of the focal lengths of a camera matrix."""
 
-    Attributes:
-        factor: Factor on the focal lengths.
-        deviation: Standard deviation of the factor's logarithm.
-        gain: Ratio of robust reprojection costs per degree of freedom, before to after correction.
-    """
-
-    factor: float
-    deviation: float
+    factor: float  # Factor on the focal lengths
+    deviation: float  # Standard deviation of the factor's logarithm
+    # Ratio of robust reprojection costs per degree of freedom, before to after correction.
     gain: float
 
 
@@ -43,14 +38,8 @@ def focal_factor(
 ) -> Focal | None:
     """Fit a focal length, together with the pose, to the detected keypoints of an object.
 
-    Args:
-        cuboid: Keypoints of the object, metres.
-        keypoints: Detected positions of the keypoints, pixels; NaN if missing.
-        T_cam_obj: Pose estimated with K, metres; start of the fit.
-        K: Camera matrix, pixels.
-
-    Returns:
-        The correction, or None with fewer than eight keypoints.
+    Missing ``keypoints`` (pixels) are NaN. ``T_cam_obj``, estimated with K, starts the fit. With
+    fewer than eight keypoints, the result is None.
     """
     is_known = np.isfinite(keypoints).all(axis=1)
     if is_known.sum() < MIN_POINTS:

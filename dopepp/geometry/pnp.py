@@ -27,6 +27,7 @@ from dopepp.geometry.refine import (
     MIN_POINTS,
     NO_GATE,
     ObjectPoints,
+    Points,
     Rays,
     Whitenings,
     apply_rotation,
@@ -51,8 +52,6 @@ MAX_TANGENT: Final = 1000.0
 
 ROTATION_TOLERANCE: Final = 1e-6  # Largest error of a refined rotation matrix's entries
 PLATE: Final = 0.3  # Largest thickness over length of a part whose mirrored tilt is refined as well
-
-
 _ONE_PIXEL: Final = np.eye(2)
 
 
@@ -115,7 +114,8 @@ def solve_pnp(
     covariances = np.broadcast_to(np.asarray(covariance_px, np.float64), (n, 2, 2))
     covariances = np.ascontiguousarray(covariances)
     rays, whitening, usable = _prepare(object_points, image_points, K, covariances)
-    result = _solve(object_points[usable], rays, K[:2, :2].copy(), whitening, widenings)
+    points = Points(object_points[usable], rays, whitening)
+    result = _solve(points, K[:2, :2].copy(), widenings)
     inliers = np.zeros(n, bool)
     inliers[usable] = result.inliers
     return replace(result, inliers=inliers)
@@ -173,15 +173,12 @@ def _is_pinhole(K: CameraMatrix) -> bool:
 
 
 def _solve(
-    object_points: ObjectPoints,
-    rays: Rays,
-    to_px: Float[np.ndarray, "2 2"],
-    whitening: Whitenings,
-    widenings: Sequence[float],
+    points: Points, to_px: Float[np.ndarray, "2 2"], widenings: Sequence[float]
 ) -> PnPResult:
-    """Solve for usable points; ``to_px`` maps rays to pixels, ``whitening`` is for pixel errors."""
+    """Solve for usable points with whitenings of pixels; ``to_px`` maps rays to pixels."""
+    object_points, rays, whitening = points
     no_inliers = np.zeros(len(rays), bool)
-    if reason := degenerate(object_points, rays, to_px, whitening):
+    if reason := degenerate(points, to_px):
         return PnPResult(None, math.inf, no_inliers, reason)
     centre = object_points.mean(0)
     size = math.hypot(*(object_points.max(0) - object_points.min(0)).tolist())
@@ -197,9 +194,8 @@ def _solve(
             reason = f"only {int(agree.sum())} points agree on a pose, {MIN_POINTS} are needed"
             result = PnPResult(None, math.inf, no_inliers, reason)
         else:
-            T, error, covariance = _fit_inliers(
-                centred[agree], rays[agree], ray_whitening[agree], to_px, *pose, size, centre
-            )
+            agreeing = Points(centred[agree], rays[agree], ray_whitening[agree])
+            T, error, covariance = _fit_inliers(agreeing, to_px, *pose, size, centre)
             result = PnPResult(T, error, agree, "", covariance)
         results.append(result)
         if 3 * result.inliers.sum() >= 2 * len(rays):
@@ -209,14 +205,7 @@ def _solve(
 
 @compiled()
 def _fit_inliers(
-    object_points: ObjectPoints,
-    rays: Rays,
-    whitening: Whitenings,
-    to_px: Float[np.ndarray, "2 2"],
-    R: RotationMatrix,
-    t: Vector,
-    size: float,
-    centre: Vector,
+    points: Points, to_px: Array, R: RotationMatrix, t: Vector, size: float, centre: Vector
 ) -> tuple[Transform, float, Float[np.ndarray, "6 6"]]:
     """Fit the pose (R, t) to its inliers by least squares, in place.
 
@@ -227,13 +216,12 @@ def _fit_inliers(
     """
     # Least squares is the best estimate for points that agree. A rotation ω about the points'
     # centre is the same rotation about the object's origin and a shift by centre × ω.
-    refine_pose(object_points, rays, whitening, R, t, NO_GATE)
+    rays = points.rays
+    refine_pose(points, R, t, NO_GATE)
     residuals = np.empty((len(rays), 2))
-    reproject(object_points, rays, whitening, R, t, residuals)
+    reproject(points, R, t, residuals)
     information, gradient = np.empty((6, 6)), np.empty(6)
-    normal_equations(
-        object_points, rays, whitening, R, t, residuals, NO_GATE, information, gradient
-    )
+    normal_equations(points, R, t, residuals, NO_GATE, information, gradient)
     moved = np.zeros(3)
     for k in range(3):
         moved[k] = R[k, 0] * centre[0] + R[k, 1] * centre[1] + R[k, 2] * centre[2]
@@ -242,12 +230,12 @@ def _fit_inliers(
         T[k, 3] = size * t[k] - moved[k]
         for m in range(3):
             T[k, m] = R[k, m]
-    pixels = np.empty(whitening.shape)
+    pixels = np.empty(points.whitening.shape)
     for i in range(len(pixels)):
         for k in range(2):
             for m in range(2):
                 pixels[i, k, m] = to_px[k, m]
-    reproject(object_points, rays, pixels, R, t, residuals)
+    reproject(Points(points.solid, rays, pixels), R, t, residuals)
     squared = 0.0
     for i in range(len(rays)):
         for k in range(2):
@@ -304,12 +292,12 @@ def _best_pose(
 ) -> tuple[tuple[RotationMatrix, Vector] | None, Bool[np.ndarray, "n"]]:
     """Return the refined pose with the smallest truncated cost, or None, and the inlier mask."""
     R, t, cost = np.empty((3, 3)), np.empty(3), math.inf
-    points, rays, count = starts.object_points, starts.rays, len(whitening)
+    points, count = Points(starts.object_points, starts.rays, whitening), len(whitening)
     normal, is_plate = starts.normal, starts.is_plate
     agree = np.zeros(count, bool)
     for left_out in range(min(MAX_LEFT_OUT, count - MIN_POINTS) + 1):
         poses = starts.without(left_out)
-        cost = _improve(points, rays, whitening, poses, normal, is_plate, R, t, cost, agree)
+        cost = _improve(points, poses, normal, is_plate, R, t, cost, agree)
         if cost < math.inf and agree.sum() >= count - left_out:
             break
     return (None if cost == math.inf else (R, t)), agree
@@ -317,9 +305,7 @@ def _best_pose(
 
 @compiled()
 def _improve(
-    object_points: ObjectPoints,
-    rays: Rays,
-    whitening: Whitenings,
+    points: Points,
     starts: Float[np.ndarray, "s 6"],
     normal: Vector,
     is_plate: bool,
@@ -336,12 +322,12 @@ def _improve(
     Returns:
         The truncated cost of the best pose.
     """
-    count = len(starts)
+    count, rays = len(starts), points.rays
     residuals = np.empty((len(rays), 2))
     rotations, costs = np.empty((count, 3, 3)), np.empty(count)
     for s in range(count):
         apply_rotation(starts[s], np.eye(3), rotations[s])
-        reproject(object_points, rays, whitening, rotations[s], starts[s, 3:], residuals)
+        reproject(points, rotations[s], starts[s, 3:], residuals)
         costs[s] = _truncated_cost(residuals)
     R, t = np.empty((3, 3)), np.empty(3)
     for s in costs.argsort()[:NUM_STARTS]:
@@ -349,10 +335,10 @@ def _improve(
             copy_pose(rotations[s], starts[s, 3:], R, t)
             if tilt:
                 _mirror(R, t, normal)
-            refine_pose(object_points, rays, whitening, R, t, GATE)
-            if not _is_plausible(object_points, R, t):
+            refine_pose(points, R, t, GATE)
+            if not _is_plausible(points.solid, R, t):
                 continue
-            reproject(object_points, rays, whitening, R, t, residuals)
+            reproject(points, R, t, residuals)
             cost = _truncated_cost(residuals)
             if cost < best:
                 best = cost

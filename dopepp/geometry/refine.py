@@ -7,7 +7,7 @@ of numerical tolerances serves every part and camera. A pose is (R, t) with x_ca
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -40,13 +40,18 @@ _TINY_ANGLE: Final = 1e-8
 MIN_POINTS: Final = 4
 
 ObjectPoints = Float[np.ndarray, "n 3"]
-"""Points of an object; during refinement centred and of unit size."""
-
 Rays = Float[np.ndarray, "n 2"]
-"""Measured ray (x/z, y/z) of each point."""
-
 Whitenings = Float[np.ndarray, "n 2 2"]
-"""Matrix of each point from ray differences to standard deviations of the pixel's position."""
+
+
+class Points(NamedTuple):
+    """Points of an object and their images; during refinement centred and of unit size."""
+
+    solid: ObjectPoints  # Positions in the object frame
+    rays: Rays  # Measured ray (x/z, y/z) of each point
+    # Matrix of each point from ray differences to standard deviations of the pixel.
+    whitening: Whitenings
+
 
 SMALLEST: Final = 1e-9  # Smallest valid extent of the object points, metres
 LARGEST: Final = 1e9  # Largest valid extent of the object points, metres
@@ -54,34 +59,27 @@ SAME_PIXEL: Final = 1e-3  # Largest difference of two positions that count as eq
 
 
 @compiled()
-def refine_pose(
-    object_points: ObjectPoints,
-    rays: Rays,
-    whitening: Whitenings,
-    R: RotationMatrix,
-    t: Vector,
-    gate: float,
-) -> None:
+def refine_pose(points: Points, R: RotationMatrix, t: Vector, gate: float) -> None:
     """Refine the pose (R, t) in place: minimise the Geman–McClure cost Σ r²/(r² + g²), gate g.
 
     Steps are damped, and a step that does not reduce the cost is repeated with more damping
     (Levenberg–Marquardt). A pose with points behind the camera remains unchanged.
     """
-    n = len(rays)
+    n = len(points.rays)
     residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
     moved_R, moved_t = np.empty((3, 3)), np.empty(3)
     hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
     workspace = np.empty((7, 6))
-    if not reproject(object_points, rays, whitening, R, t, residuals):
+    if not reproject(points, R, t, residuals):
         return
     cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
-    normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
+    normal_equations(points, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
         solve_inside(hessian, gradient, damping, step, workspace)
         apply_rotation(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
-        reproject(object_points, rays, whitening, moved_R, moved_t, moved_residuals)
+        reproject(points, moved_R, moved_t, moved_residuals)
         moved_cost = _robust_cost(moved_residuals, gate)
         if moved_cost < cost:
             arrived = cost - moved_cost <= CONVERGED * cost + ROUNDING
@@ -92,9 +90,7 @@ def refine_pose(
             if arrived:
                 return
             damping = max(damping / 10, MIN_DAMPING)
-            normal_equations(
-                object_points, rays, whitening, R, t, residuals, gate, hessian, gradient
-            )
+            normal_equations(points, R, t, residuals, gate, hessian, gradient)
         else:
             damping *= 10
             if damping >= MAX_DAMPING:
@@ -102,18 +98,12 @@ def refine_pose(
 
 
 @compiled()
-def reproject(
-    object_points: ObjectPoints,
-    rays: Rays,
-    whitening: Whitenings,
-    R: RotationMatrix,
-    t: Vector,
-    out: Float[np.ndarray, "n 2"],
-) -> bool:
-    """Write the whitened reprojection errors; return whether all points are in front of the camera.
+def reproject(points: Points, R: RotationMatrix, t: Vector, out: Array) -> bool:
+    """Write the whitened reprojection errors (n, 2); NaN for points behind the camera.
 
-    The errors of points behind the camera are NaN.
+    Return whether all points are in front of the camera.
     """
+    object_points, rays, whitening = points
     in_front = True
     for i in range(len(rays)):
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
@@ -150,32 +140,25 @@ def _robust_cost(residuals: Array, gate: float) -> float:
 
 @compiled()
 def normal_equations(
-    object_points: ObjectPoints,
-    rays: Rays,
-    whitening: Whitenings,
-    R: RotationMatrix,
-    t: Vector,
-    residuals: Float[np.ndarray, "n 2"],
-    gate: float,
-    hessian: Float[np.ndarray, "6 6"],
-    gradient: Float[np.ndarray, "6"],
+    points: Points, R: Array, t: Array, errors: Array, gate: float, hessian: Array, gradient: Array
 ) -> None:
     """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), with robust weights.
 
-    The residuals are the whitened reprojection errors of :func:`reproject`.
+    The errors are the whitened reprojection errors of :func:`reproject`.
 
     The derivatives of a ray (u, v) = (X, Y)/Z by x_cam are [1, 0, −u]/Z and [0, 1, −v]/Z. Since
     d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
     derivative of r²/(r² + g²) by r², times g², with the gate g. Points behind the camera are
     ignored.
     """
+    object_points, rays, whitening = points
     for c in range(6):
         gradient[c] = 0.0
         for d in range(6):
             hessian[c, d] = 0.0
     rows, jacobian = np.empty((2, 6)), np.empty(6)
     for i in range(len(rays)):
-        squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
+        squared = errors[i, 0] ** 2 + errors[i, 1] ** 2
         if not squared >= 0.0:
             continue
         x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
@@ -194,7 +177,7 @@ def normal_equations(
             for c in range(6):
                 jacobian[c] = a * rows[0, c] + b * rows[1, c]
             for c in range(6):
-                gradient[c] += weight * jacobian[c] * residuals[i, r]
+                gradient[c] += weight * jacobian[c] * errors[i, r]
                 for d in range(c + 1):
                     hessian[c, d] += weight * jacobian[c] * jacobian[d]
     for c in range(6):
@@ -256,22 +239,16 @@ def apply_rotation(step: Array, R: Array, out: Array) -> None:
         out[2, c] = pz + a * qz + b * (x * qy - y * qx)
 
 
-def degenerate(
-    object_points: ObjectPoints,
-    rays: Rays,
-    to_px: Float[np.ndarray, "2 2"],
-    whitening: Whitenings,
-) -> str:
+def degenerate(points: Points, to_px: Float[np.ndarray, "2 2"]) -> str:
     """Return why the points do not determine a pose, or an empty string.
 
     Here, points are in metres, and the whitenings map pixels instead of rays. ``to_px`` maps rays
     to pixels.
     """
-    if len(object_points) < MIN_POINTS:
-        return too_few(len(object_points))
-    extent, length, breadth, distinct, image_length, image_breadth, noise = _spreads(
-        object_points, rays, to_px, whitening
-    )
+    count = len(points.rays)
+    if count < MIN_POINTS:
+        return too_few(count)
+    extent, length, breadth, distinct, image_length, image_breadth, noise = _spreads(points, to_px)
     if not SMALLEST < extent < LARGEST:
         return f"the object points extend over {extent:.3g} m"
     if breadth < 1e-6 * length:
@@ -280,7 +257,7 @@ def degenerate(
         return f"only {int(distinct)} distinct pixels, {MIN_POINTS} are needed"
     if image_breadth < 1e-3 * image_length:
         return "the pixels lie on one line"
-    if math.hypot(image_length, image_breadth) < noise * math.sqrt(len(rays)):
+    if math.hypot(image_length, image_breadth) < noise * math.sqrt(count):
         return "the pixels spread no wider than their own noise"
     return ""
 
@@ -292,7 +269,7 @@ def too_few(num_points: int) -> str:
 
 @compiled()
 def _spreads(
-    object_points: Array, rays: Array, to_px: Array, whitening: Array
+    points: Points, to_px: Array
 ) -> tuple[float, float, float, float, float, float, float]:
     """Return the spreads that :func:`degenerate` compares.
 
@@ -300,8 +277,8 @@ def _spreads(
     by the extent, the number of distinct pixels, the pixels' two singular values, and the median
     deviation (det W)^(−1/2), both in pixels.
     """
-    n = len(object_points)
-    extent = 0.0
+    object_points, rays, whitening = points
+    n, extent = len(rays), 0.0
     for axis in range(3):
         lowest = highest = object_points[0, axis]
         for i in range(n):

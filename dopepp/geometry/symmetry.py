@@ -38,22 +38,22 @@ def symmetry_group(
     As in BOP, every step of a continuous symmetry is combined with every discrete symmetry. A part
     with two axes that are not parallel is a ball, whose rotations are 0.2 rad apart.
 
-    Args:
-        discrete: BOP-style rigid transforms without the identity, metres.
-        continuous: BOP-style (axis, offset) pairs, metres.
-        max_step: Largest move of a point at half a diameter from the axis, diameters.
+    Both kinds of symmetries are as in BOP, metres; ``discrete`` lacks the identity. ``max_step`` is
+    the largest move of a point at half a diameter from the axis, diameters.
 
     Raises:
-        ValueError: ``max_step`` is not positive or an axis has no length.
+        ValueError: An axis has no length.
     """
-    if not max_step > 0:
-        raise ValueError(f"max_step must be positive, got {max_step}")
     group = np.eye(4)[None]
-    if discrete is not None and len(discrete):
-        group = np.concatenate([group, np.asarray(discrete, np.float64)])
+    if discrete is not None:
+        group = np.concatenate([group, np.asarray(discrete, np.float64).reshape(-1, 4, 4)])
     if not continuous:
         return group
-    axes = np.array([_normalise(axis) for axis, _ in continuous])
+    axes = np.array([axis for axis, _ in continuous], np.float64)
+    lengths = np.array([np.linalg.norm(axis) for axis in axes])
+    if not ((lengths > 0) & np.isfinite(lengths)).all():
+        raise ValueError(f"an axis of symmetry must have a length, got {axes.tolist()}")
+    axes /= lengths[:, None]
     offset = np.array(continuous[0][1], np.float64)
     if np.linalg.norm(np.cross(axes[0], axes), axis=1).max() > _PARALLEL:
         return rotations_about(offset, _ball_rotations(max(2 * max_step, BALL_STEP)))
@@ -61,14 +61,6 @@ def symmetry_group(
     angles = np.arange(count) * (2 * math.pi / count)
     about_axis = rotations_about(offset, rotation_vector_to_matrix(angles[:, None] * axes[0]))
     return np.asarray((about_axis[None] @ group[:, None]).reshape(-1, 4, 4))
-
-
-def _normalise(axis: Sequence[float]) -> Vector:
-    """Return an axis normalised to length 1."""
-    length = float(np.linalg.norm(axis))
-    if not 0 < length < math.inf:
-        raise ValueError(f"an axis of symmetry must have a length, got {list(axis)}")
-    return np.array(axis, np.float64) / length
 
 
 def rotations_about(

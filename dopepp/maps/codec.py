@@ -37,17 +37,13 @@ not change the float64 rank."""
 
 @dataclass(frozen=True)
 class MapGeometry:
-    """Geometry of maps relative to the network's input.
+    """Geometry of maps relative to the network's input."""
 
-    Attributes:
-        stride: Input pixels per cell. Cell i covers pixels ``stride·i … stride·i + stride − 1``,
-            so its centre is pixel ``stride·i + (stride − 1)/2``.
-        sigma: Standard deviation of a target's belief peak, cells.
-        field_radius: Radius of the disc around a corner in which the field is defined, cells.
-    """
-
+    # Input pixels per cell. Cell i covers pixels ``stride·i … stride·i + stride − 1``, so its
+    # centre is pixel ``stride·i + (stride − 1)/2``.
     stride: int = 8
-    sigma: float = 1.0
+    sigma: float = 1.0  # Standard deviation of a target's belief peak, cells
+    # Radius of the disc around a corner in which the field is defined, cells.
     field_radius: float = 2.0
 
     def to_cells(self, pixels: Tensor) -> Tensor:
@@ -68,12 +64,8 @@ def encode(
     map or not finite are ignored. In the disc around a corner, the field (x, y) is the unit vector
     from this corner to its instance's centroid; where discs overlap, the nearest corner counts.
 
-    Args:
-        keypoints: (x, y) of corners 0–7 and the centroid, pixels of the network's input.
-        object_index: Index (0 to C − 1) of each instance's object; −1 marks padding.
-        num_objects: Number of objects C.
-        map_size: (height, width) of the maps, cells.
-        geometry: Stride, peak width and disc radius.
+    ``keypoints`` are corners 0–7 and the centroid, (x, y) in pixels of the network's input. An
+    ``object_index`` of −1 marks padding. ``map_size`` is (height, width), cells.
     """
     height, width = map_size
     cells = geometry.to_cells(keypoints.float())
@@ -115,21 +107,18 @@ def encode(
 
 @dataclass(frozen=True)
 class Peaks:
-    """The highest local maxima of every belief channel, by descending belief.
+    """The highest local maxima of every belief channel, by descending belief."""
 
-    Attributes:
-        position: (x, y) in pixels of the network's input; NaN in an empty slot.
-        score: Belief at the peak's cell; 0 in an empty slot.
-        covariance_px: Covariance of the position, pixels²: the excess variance of the peak over a
-            target peak, plus the variance of the fit. A network trained with a proper loss returns
-            the target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Weighted mean (x, y) of the unit vectors of the field around a corner's peak; the
-            more they differ, the shorter it is. Zero for a centroid.
-    """
-
+    # (x, y) in pixels of the network's input; NaN in an empty slot.
     position: Float[np.ndarray, "batch channels peaks 2"]
+    # Belief at the peak's cell; 0 in an empty slot.
     score: Float[np.ndarray, "batch channels peaks"]
+    # Covariance of the position, pixels²: the excess variance of the peak over a target peak, plus
+    # the variance of the fit. A network trained with a proper loss returns the target Gaussian
+    # blurred by its own uncertainty, so variances subtract.
     covariance_px: Float[np.ndarray, "batch channels peaks 2 2"]
+    # Weighted mean (x, y) of the unit vectors of the field around a corner's peak; the more they
+    # differ, the shorter it is. Zero for a centroid.
     toward: Float[np.ndarray, "batch channels peaks 2"]
 
 
@@ -146,12 +135,7 @@ def find_peaks(
     to 1, the peak is the cell with the highest sum of 5×5 cells (usually the middle cell), or else
     the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
 
-    Args:
-        belief: Belief maps, nine channels per object.
-        geometry: Stride, peak width and disc radius.
-        threshold: Belief that a peak exceeds.
-        max_peaks: Number of slots per channel.
-        field: Vector fields, 16 channels per object; without them, ``toward`` is zero.
+    Objects have nine belief channels and 16 field channels; without ``field``, ``toward`` is zero.
     """
     maps = _on_host(belief)
     height, width = maps.shape[2:]

@@ -29,15 +29,9 @@ ROUNDING: Final = 1e-6  # above the rounding errors of squared distances, cells�
 PLATEAU: Final = 3  # Number of cells as high as the peak that indicates a clamped top
 
 STEPS: Final = 3  # Gauss–Newton steps; without noise, the start is exact.
-
-MAX_EXPONENT: Final = 10.0
-"""Largest logarithm of a fitted Gaussian, relative to the peak's belief."""
-
+MAX_EXPONENT: Final = 10.0  # Largest logarithm of a fitted Gaussian, relative to the peak's belief
 CONVERGED: Final = 1e-4  # Largest parameter change at convergence: 1e-3 px at stride 8
-
-SHAPE_PRIOR: Final = 0.5
-"""Prior standard deviation of a peak's curvature, relative to the target's."""
-
+SHAPE_PRIOR: Final = 0.5  # Prior standard deviation of a peak's curvature, relative to the target's
 RIDGE: Final = 1e-14  # Determines directions in which no cell exceeds the floor.
 MIN_CURVATURE: Final = 1e-3  # 1/cells²: a standard deviation of 22 cells
 
@@ -55,14 +49,10 @@ def fit_peaks(
     b² compensate for their amplification of noise (Guo, IEEE SPM 2011). Gauss–Newton on b then
     removes the bias that noise causes in logarithms.
 
-    Args:
-        belief: Belief map of the channel, (height, width).
-        cells: (column, row) of each peak.
-        half: Half-width of the fitted window, cells.
-        sigma: Standard deviation of a target peak, cells.
-        position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells²: the covariance of the fit
-            plus the fitted variance, reduced by its standard error, in excess of ``sigma``².
+    ``cells`` are (column, row) of each peak, ``half`` is the half-width of the window and ``sigma``
+    the standard deviation of a target peak. ``position`` is filled with (x, y) of each peak, and
+    ``covariance`` with the covariance of the fit plus the fitted variance, reduced by its standard
+    error, in excess of ``sigma``². All lengths are cells.
     """
     (height, width), count, side = belief.shape, len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
@@ -123,12 +113,9 @@ def mean_vectors(
     Where discs overlap, a cell's vector belongs to the nearest peak. At distance d, the weight
     1 − (d/radius)² falls to 0 at the disc's edge, where inexact positions make vectors uncertain.
 
-    Args:
-        vectors: x and y component of the field, (2, height, width).
-        cells: (column, row) of each peak.
-        position: Fitted (x, y) of each peak, cells.
-        radius: Radius of the discs, cells.
-        toward: Filled with the mean vector of each peak; must be zero on entry.
+    ``vectors`` are the field's components (2, height, width), ``cells`` the (column, row) and
+    ``position`` the fitted (x, y) of each peak, cells. ``toward``, zero on entry, is filled with
+    the mean vector of each peak.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)

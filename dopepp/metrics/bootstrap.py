@@ -32,6 +32,8 @@ _Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
 StatisticName = Literal["mean", "median"]
 
 _BLOCK: Final = 4_000_000  # Count of numbers resampled at once: 32 MB
+_CONFIDENCE: Final = 0.95
+_LEVEL: Final = (1 + _CONFIDENCE) / 2  # quantile at the upper end of a two-sided interval
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,7 @@ class Difference:
 
     Attributes:
         value: The method's statistic minus the baseline's.
-        low: Lower end of the confidence interval.
-        high: Upper end of the confidence interval.
+        low, high: Ends of the 95 % confidence interval.
         num_differing: Number of instances on which the methods differ.
         fewest: Smallest ``num_differing`` that can be significant (:func:`fewest_differing`).
         seeds_needed: Estimated number of seeds that would make the difference significant
@@ -67,7 +68,6 @@ def paired_difference(
     statistic: StatisticName = "mean",
     *,
     same_seeds: bool = True,
-    confidence: float = 0.95,
     num_resamples: int = 5000,
     few_seeds: bool = True,
     seed: int = 0,
@@ -82,7 +82,6 @@ def paired_difference(
         baseline: Values of the baseline, on the same instances.
         statistic: Name of the statistic.
         same_seeds: Whether row s of both methods has the same seed, to resample seeds in pairs.
-        confidence: Share of the resamples inside the interval.
         num_resamples: Number of resamples.
         few_seeds: Whether to correct for few seeds. Resamples of S seeds spread less than new
             seeds, so the seed effect of each resample is multiplied by t₍S₋₁₎ / z · √(S / (S − 1)),
@@ -111,20 +110,20 @@ def paired_difference(
     resampled = _resampled_difference(mine, baseline, compute, draws, rng)
     effects = [figures[0] - figures[1]] if same_seeds else [figures[0], -figures[1]]
     if few_seeds:
-        resampled += sum(map(_stretching, effects, draws, [confidence] * 2))
+        resampled += sum(map(_stretching, effects, draws))
     defined = resampled[~np.isnan(resampled)]
     if not len(defined):
         return None
-    tail = (1 - confidence) / 2
+    tail = (1 - _CONFIDENCE) / 2
     low, high = np.quantile(defined, [tail, 1 - tail])
     value = float(figures[0].mean() - figures[1].mean())
     paired = same_seeds and len(figures[0]) > 1 and statistic == "mean"
-    needed = seeds_needed(mine, baseline, confidence) if paired else None
-    num_differing, fewest = _num_differing(mine, baseline), fewest_differing(confidence)
+    needed = seeds_needed(mine, baseline) if paired else None
+    num_differing, fewest = _num_differing(mine, baseline), fewest_differing(_CONFIDENCE)
     return Difference(value, float(low), float(high), num_differing, fewest, needed)
 
 
-def seeds_needed(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> float:
+def seeds_needed(mine: Numbers, baseline: Numbers) -> float:
     """Estimate how many paired seeds would make a difference in means significant.
 
     With S seeds the interval's half-width is √(z² · V + t₍S₋₁₎² · W / S), where V is the variance
@@ -139,15 +138,14 @@ def seeds_needed(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> 
     effects = np.mean([values.mean(axis=1) for values in differences], axis=0)
     variances = [v.mean(axis=0).var(ddof=1) / v.shape[1] for v in differences]
     over_instances = sum(variances)
-    level = (1 + confidence) / 2
-    z = norm.ppf(level)
+    z = norm.ppf(_LEVEL)
     room = effects.mean() ** 2 - z**2 * over_instances / len(differences) ** 2
     if room <= 0:
         return math.inf
     over_seeds = effects.var(ddof=1)
     # Student's t exceeds z, so z gives a lower bound; t is close to z, so the search is short.
     fewest = max(len(effects) + 1, math.ceil(z**2 * over_seeds / room))
-    spread = ((num, t.ppf(level, num - 1) ** 2 * over_seeds) for num in itertools.count(fewest))
+    spread = ((num, t.ppf(_LEVEL, num - 1) ** 2 * over_seeds) for num in itertools.count(fewest))
     return float(next(num for num, reached in spread if reached < room * num))
 
 
@@ -225,7 +223,7 @@ def _resampled_difference(
 
 
 def _stretching(
-    effects: Float[np.ndarray, "seeds"], draws: Draws, confidence: float
+    effects: Float[np.ndarray, "seeds"], draws: Draws
 ) -> Float[np.ndarray, "resamples"]:
     """Return a term per resample that widens the distribution, too narrow for few seeds.
 
@@ -235,8 +233,7 @@ def _stretching(
     num = len(effects)
     if num == 1:
         return np.zeros(len(draws))
-    level = (1 + confidence) / 2
-    factor = t.ppf(level, num - 1) / norm.ppf(level) * math.sqrt(num / (num - 1))
+    factor = t.ppf(_LEVEL, num - 1) / norm.ppf(_LEVEL) * math.sqrt(num / (num - 1))
     return np.asarray((factor - 1) * (draws @ (effects - effects.mean())))
 
 

@@ -43,23 +43,14 @@ Errors = Float[np.ndarray, "estimates targets"]
 
 @dataclass(frozen=True)
 class BopScores:
-    """Scores over all targets of all objects, in [0, 1].
+    """Scores over all targets of all objects, in [0, 1]."""
 
-    Attributes:
-        num_targets: Number of target instances.
-        ar_vsd: Average recall of VSD; None if an image has no depth or a part no mesh.
-        ar_mssd: Average recall of MSSD.
-        ar_mspd: Average recall of MSPD.
-        ar: Mean of AR_VSD, AR_MSSD and AR_MSPD; None without AR_VSD.
-        add_or_s_01d: Recall of ADD (ADD-S for symmetric parts) below a tenth of the diameter.
-    """
-
-    num_targets: int
-    ar_vsd: float | None
-    ar_mssd: float
-    ar_mspd: float
-    ar: float | None
-    add_or_s_01d: float
+    num_targets: int  # Number of target instances
+    ar_vsd: float | None  # Average recall of VSD; None if an image has no depth or a part no mesh
+    ar_mssd: float  # Average recall of MSSD
+    ar_mspd: float  # Average recall of MSPD
+    ar: float | None  # Mean of AR_VSD, AR_MSSD and AR_MSPD; None without AR_VSD
+    add_or_s_01d: float  # Recall of ADD (ADD-S for symmetric parts) below a tenth of the diameter
 
     def in_words(self) -> str:
         """Return the scores as one line of text."""

@@ -28,15 +28,9 @@ from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
-
-MAX_MATCHING_RADIUS: Final = 0.1
-"""Largest matching radius of any part, metres."""
-
-MIN_VISIBLE_FRACTION: Final = 0.1
-"""Smallest visible share of an evaluated instance's silhouette."""
-
-CurveMeasure = Literal["add", "add_s", "mssd"]
-"""Error in metres, for accuracy-threshold curves."""
+MAX_MATCHING_RADIUS: Final = 0.1  # Largest matching radius of any part, metres
+MIN_VISIBLE_FRACTION: Final = 0.1  # Smallest visible share of an evaluated instance's silhouette
+CurveMeasure = Literal["add", "add_s", "mssd"]  # Error in metres, for accuracy-threshold curves
 
 InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
 """Error of every instance, degrees or metres."""
@@ -69,19 +63,12 @@ class PredictedPose(Protocol):
 
 
 class TruePose(Protocol):
-    """Attributes of a ground-truth instance that :class:`PoseMetrics` reads.
+    """Attributes of a ground-truth instance that :class:`PoseMetrics` reads."""
 
-    Attributes:
-        label: Name of the part.
-        T_cam_obj: True pose, metres.
-        visible_fraction: Visible share of the full silhouette, in [0, 1].
-        wanted: Whether a list of targets names the instance; None without a list.
-    """
-
-    label: str
-    T_cam_obj: Transform
-    visible_fraction: float
-    wanted: bool | None
+    label: str  # Name of the part
+    T_cam_obj: Transform  # True pose, metres
+    visible_fraction: float  # Visible share of the full silhouette, in [0, 1]
+    wanted: bool | None  # Whether a list of targets names the instance; None without a list
 
 
 def matching_radius(part: Part) -> float:
@@ -131,10 +118,7 @@ def is_evaluated(instance: TruePose) -> bool:
 class PoseMetrics(Metric):
     """Accumulates detections and ground truth, image by image, and computes a row per object.
 
-    Args:
-        parts: The evaluated objects, with distinct names. Instances of other objects are ignored.
-        method: Name of the method, for the rows.
-        kwargs: Arguments of :class:`torchmetrics.Metric`.
+    Instances of objects other than ``parts`` are ignored. ``method`` names the rows.
 
     Raises:
         UserError: There are no parts, or names are not distinct.
@@ -173,11 +157,7 @@ class PoseMetrics(Metric):
     ) -> None:
         """Add the detections and the ground truth of one image.
 
-        Args:
-            detections: Detections of the evaluated parts.
-            instances: Ground truth of the image.
-            K: Camera matrix, pixels; MSPD needs it for every image.
-            width: Width of the image, pixels; given together with K.
+        MSPD needs K and the width of every image, pixels.
 
         Raises:
             UserError: A detection is of another object.
@@ -272,7 +252,6 @@ class EvaluatedInstances:
     """All evaluated instances of one object, and the scores of its false positives.
 
     Attributes:
-        part: The object.
         T_gt: True poses, metres.
         K: Camera matrices, pixels; NaN if unknown.
         visible_fractions: Visible share of each silhouette, in [0, 1].

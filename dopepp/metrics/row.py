@@ -46,33 +46,22 @@ _USUAL_MAHALANOBIS: Final = 2.3126
 
 @dataclass
 class PoseErrors:
-    """Errors of N poses of one object, infinite for a miss.
+    """Errors of N poses of one object, infinite for a miss."""
 
-    Attributes:
-        add: ADD, metres.
-        add_s: ADD-S, metres.
-        mssd: MSSD over the part's symmetries, metres.
-        mspd: MSPD over the part's symmetries, pixels of an image 640 wide; None if a camera is
-            unknown.
-        rotation_deg: Angle between the orientations, degrees.
-        rotation_s_deg: Smallest angle over the part's symmetries, degrees.
-        translation: Distance between the object frame's origins, metres; None for a reference row.
-        mahalanobis: Mahalanobis distance under the estimated covariance; infinite without a
-            covariance, None for a reference row.
-        diameter: Diameter of the part, metres.
-        num_symmetries: Number of symmetry transforms, including the identity.
-    """
-
-    add: Errors
-    add_s: Errors
-    mssd: Errors
+    add: Errors  # ADD, metres
+    add_s: Errors  # ADD-S, metres
+    mssd: Errors  # MSSD over the part's symmetries, metres
+    # MSPD over the part's symmetries, pixels of an image 640 wide; None if a camera is unknown.
     mspd: Errors | None
-    rotation_deg: Errors
-    rotation_s_deg: Errors
+    rotation_deg: Errors  # Angle between the orientations, degrees
+    rotation_s_deg: Errors  # Smallest angle over the part's symmetries, degrees
+    # Distance between the object frame's origins, metres; None for a reference row.
     translation: Errors | None
+    # Mahalanobis distance under the estimated covariance; infinite without a covariance, None for a
+    # reference row.
     mahalanobis: Errors | None
-    diameter: float
-    num_symmetries: int = 1
+    diameter: float  # Diameter of the part, metres
+    num_symmetries: int = 1  # Number of symmetry transforms, including the identity
 
     @classmethod
     def of(
@@ -86,14 +75,8 @@ class PoseErrors:
     ) -> PoseErrors:
         """Compute all errors of estimated poses from true poses.
 
-        Args:
-            part: The object.
-            T_est: Estimated poses, metres; NaN for a miss.
-            T_gt: True poses, metres.
-            K: Camera matrices, pixels; NaN if unknown.
-            width: Widths of the images, pixels; NaN if unknown.
-            covariance: Covariances as of :class:`~dopepp.recovery.detection.Detection`; NaN if
-                unknown.
+        ``T_est`` and ``T_gt`` are in metres; K and ``width`` of the images in pixels. Missed poses
+        and unknown numbers are NaN. Covariances are those of detections.
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))
@@ -138,32 +121,12 @@ class PoseRow:
 
     Shares lie in [0, 1], angles are degrees, distances metres. Medians and 90th percentiles are
     over matched instances. The class is not frozen, because torchmetrics rebuilds the rows.
-
-    Attributes:
-        object: The part's name, or ``mean``.
-        method: Source of the poses: the estimator, or the name of a reference.
-        num_instances: Number of evaluated ground-truth instances.
-        add_01d: Share of instances with ADD below a tenth of the diameter.
-        add_or_s_01d: Like ``add_01d``, with ADD-S for a part with symmetries.
-        ar_mssd: BOP's average recall of MSSD.
-        ar_mspd: BOP's average recall of MSPD; None if an image's camera is unknown.
-        mspd_5px: Share of instances with MSPD below 5 px at 640 px width; None without cameras.
-        median_deviations: Median ratio of true errors to estimated standard deviations, 1 for
-            calibrated covariances; None without covariances.
-        coverage: Share of matched poses inside their 90 % covariance region, or None.
-        matching_radius: Largest distance of a match (:func:`~dopepp.metrics.pose.matching_radius`).
-        miss_rate: Share of instances without a matched prediction.
-        precision: Share of the reported poses with ADD(-S) below a tenth of the diameter; None if
-            nothing is reported.
-        false_per_frame: Detections without an instance, per image.
-        average_precision: AP over the scores, correct with ADD(-S) below a tenth of the diameter.
-        num_symmetries: Number of symmetry transforms of the object, including the identity.
     """
 
-    object: str
-    method: str
-    num_instances: int
-    add_01d: float | None = None
+    object: str  # The part's name, or ``mean``
+    method: str  # Source of the poses: the estimator, or the name of a reference
+    num_instances: int  # Number of evaluated ground-truth instances
+    add_01d: float | None = None  # Share of instances with ADD below a tenth of the diameter
     add_005d: float | None = None
     add_002d: float | None = None
     pass_5cm: float | None = None
@@ -175,22 +138,31 @@ class PoseRow:
     median_translation: float | None = None
     p90_rotation_deg: float | None = None
     p90_translation: float | None = None
+    # Median ratio of true errors to estimated standard deviations, 1 for calibrated covariances;
+    # None without covariances.
     median_deviations: float | None = None
+    # Share of matched poses inside their 90 % covariance region, or None.
     coverage: float | None = None
+    # Largest distance of a match (:func:`~dopepp.metrics.pose.matching_radius`).
     matching_radius: float | None = None
-    miss_rate: float | None = None
+    miss_rate: float | None = None  # Share of instances without a matched prediction
+    # Share of the reported poses with ADD(-S) below a tenth of the diameter; None if nothing is
+    # reported.
     precision: float | None = None
-    false_per_frame: float | None = None
+    false_per_frame: float | None = None  # Detections without an instance, per image
+    # AP over the scores, correct with ADD(-S) below a tenth of the diameter.
     average_precision: float | None = None
     mssd_01d: float | None = None
-    ar_mssd: float | None = None
+    ar_mssd: float | None = None  # BOP's average recall of MSSD
+    # BOP's average recall of MSPD; None if an image's camera is unknown.
     ar_mspd: float | None = None
+    # Share of instances with MSPD below 5 px at 640 px width; None without cameras.
     mspd_5px: float | None = None
     median_rotation_s_deg: float | None = None
-    add_or_s_01d: float | None = None
+    add_or_s_01d: float | None = None  # Like ``add_01d``, with ADD-S for a part with symmetries
     auc_or_s_10cm: float | None = None
     pass_5cm_5deg: float | None = None
-    num_symmetries: int = 1
+    num_symmetries: int = 1  # Number of symmetry transforms of the object, including the identity
 
 
 Formula = Callable[[PoseErrors], float | None]
@@ -199,22 +171,15 @@ Formula = Callable[[PoseErrors], float | None]
 
 @dataclass(frozen=True)
 class Column:
-    """How a field of :class:`PoseRow` is computed and displayed.
+    """How a field of :class:`PoseRow` is computed and displayed."""
 
-    Attributes:
-        field: Name of the field.
-        heading: Heading with the unit.
-        scale: Factor from the stored to the displayed unit.
-        decimals: Displayed digits after the point.
-        group: Group in a printed table; only parts with symmetries have the group ``symmetry``.
-        formula: Function of the errors; None if errors alone do not determine the measure.
-    """
-
-    field: str
-    heading: str
-    scale: float = 1.0
-    decimals: int = 0
+    field: str  # Name of the field
+    heading: str  # Heading with the unit
+    scale: float = 1.0  # Factor from the stored to the displayed unit
+    decimals: int = 0  # Displayed digits after the point
+    # Group in a printed table; only parts with symmetries have the group ``symmetry``.
     group: str = ""
+    # Function of the errors; None if errors alone do not determine the measure.
     formula: Formula | None = None
 
     def text(self, row: PoseRow) -> str:

@@ -30,8 +30,7 @@ from dopepp.virtual.presets import Preset
 from dopepp.virtual.renderers.raster.visibility import centres_within, draw_alone, project_object
 from dopepp.virtual.scene import NEAR, Material, SceneObject
 
-_REDRAWS: Final = 25
-"""Positions to sample before a new orientation is sampled; some orientations never fit."""
+_REDRAWS: Final = 25  # positions to sample with one orientation; some orientations never fit
 
 
 class Composition:

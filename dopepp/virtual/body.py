@@ -27,24 +27,17 @@ from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
 
-WALL: Final = 0.03
-"""Thickness of a bin's walls, divided by the side length of its interior."""
+WALL: Final = 0.03  # Thickness of a bin's walls, divided by the side length of its interior
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface that can be posed.
-
-    Attributes:
-        part: The part, if the network must detect it; None for a distractor.
-        source: Original of a stretched body, None for other bodies.
-        stretch: Factors along the x, y and z axes of the source.
-    """
+    """A surface that can be posed."""
 
     surface: Surface
-    part: Part | None = None
-    source: Body | None = None
-    stretch: Triple = (1.0, 1.0, 1.0)
+    part: Part | None = None  # The part, if the network must detect it; None for a distractor
+    source: Body | None = None  # Original of a stretched body, None for other bodies
+    stretch: Triple = (1.0, 1.0, 1.0)  # Factors along the x, y and z axes of the source
 
     @cached_property
     def hull(self) -> Hull:
@@ -81,18 +74,13 @@ def make_body(part: Part, *, is_target: bool) -> Body:
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A body's convex hull and centre of mass.
+    """A body's convex hull and centre of mass."""
 
-    Attributes:
-        vertices: Object frame, metres; in any orientation, the body's lowest point is one of them.
-        facets: Index of the flat face to which each triangle belongs.
-        centre: Centre of mass of the solid body, object frame, metres.
-    """
-
+    # Object frame, metres; in any orientation, the body's lowest point is one of them.
     vertices: Vertices
     triangles: Int[np.ndarray, "triangles 3"]
-    facets: Int[np.ndarray, "triangles"]
-    centre: Vector
+    facets: Int[np.ndarray, "triangles"]  # Index of the flat face to which each triangle belongs
+    centre: Vector  # Centre of mass of the solid body, object frame, metres
 
     def scaled(self, scale: Vector) -> Hull:
         """Return the hull stretched along the object's x, y and z by positive factors."""

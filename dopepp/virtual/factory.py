@@ -50,7 +50,7 @@ class Factory:
     Args:
         parts: Targets, with distinct names.
         preset: Distribution of the scenes.
-        seed: Seed of all images, at least 0.
+        seed: Seed of all images.
         backgrounds: Source of background images (default: procedural textures).
         renderer: Name of a renderer (:mod:`dopepp.virtual.renderers`).
         negatives: Parts to show among the distractors, so that a network learns to reject them;
@@ -91,13 +91,9 @@ class Factory:
     def render(self, epoch: int, index: int, scale: float = 1.0, view: int = 0) -> Rendered:
         """Render an image with its ground truth, including the sensor's effects.
 
-        Args:
-            epoch: Epoch of the image.
-            index: Index of the image within the epoch.
-            scale: Magnification of the targets, relative to the preset.
-            view: Index of the camera of the static scene; 0 is the preset's camera. Other cameras
-                are turned by :data:`BESIDE_DEG` about the middle of the targets and stay above
-                the table.
+        The targets are magnified by ``scale``. Camera ``view`` 0 of the static scene is the
+        preset's; others are turned by :data:`BESIDE_DEG` about the middle of the targets and stay
+        above the table.
 
         Raises:
             UserError: The preset cannot show the part, or the camera would be below the table.
@@ -163,13 +159,10 @@ class Factory:
                 "a part that the preset's distances and field of view can show",
                 "set the unit of the mesh file, or the preset's distances or field of view",
             )
-        objects = [
-            replace(item, T_cam_obj=_shift(item.T_cam_obj, shift)) for item in composition.objects
-        ]
+        placed = composition.objects
+        objects = [replace(item, T_cam_obj=_shift(item.T_cam_obj, shift)) for item in placed]
         # ``reach`` stays, so the lamps light the scene as before.
-        lights = tuple(
-            replace(light, position=triple(np.array(light.position) + shift)) for light in lights
-        )
+        lights = tuple(replace(light, position=triple(light.position + shift)) for light in lights)
         sensor = preset.sensors.draw(rng)
         return Scene(K, background, _in_front(objects), lights, ambient, plane, sensor)
 
@@ -177,8 +170,8 @@ class Factory:
 def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
     """Return the shift of the world that magnifies the targets, in metres in the camera frame.
 
-    The shift divides the distance of the targets' mean centre from the camera by ``scale``, a
-    positive number. Without targets, the shift is zero.
+    The shift divides the distance of the targets' mean centre from the camera by ``scale``. It is
+    zero without targets.
     """
     middle = _middle(objects)
     return np.zeros(3) if middle is None or scale == 1 else np.asarray((1 / scale - 1) * middle)

@@ -39,12 +39,8 @@ def arrange_heap(
 ) -> Transform:
     """Add a heap of targets and distractors to a composition, and sample a view of the heap.
 
-    Args:
-        composition: Composition of the image; its generator samples the view and materials.
-        table: Distribution of the views.
-        pile: Distribution of the heaps.
-        targets: Targets of the heap.
-        drawing: Generator of the heap's objects and poses.
+    The composition's generator samples the view and the materials, ``drawing`` the heap's objects
+    and poses.
 
     Returns:
         T_cam_table (plane z = 0, z up). Without a view that shows a target, no object is added.

@@ -12,7 +12,6 @@ from jaxtyping import Float, Float32, Int16
 
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
-from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.parts.part import Part
 from dopepp.virtual.sensor import Sensor
@@ -31,18 +30,13 @@ def triple(values: Iterable[float]) -> Triple:
 
 @dataclass(frozen=True)
 class Grooves:
-    """Fine parallel grooves that tilt a surface's normal: layer lines of 3D prints, brushed metal.
+    """Fine parallel grooves that tilt normals: layer lines of 3D prints, brushed metal."""
 
-    Attributes:
-        axis: Unit vector across the grooves, object frame.
-        pitch: Distance between grooves, metres; grooves finer than a pixel widen the highlight.
-        slope: Largest slope of a groove's flanks, the tangent of the normal's tilt.
-        irregularity: 0 for even grooves (layer lines), 1 for random depths and widths (brushing).
-    """
-
-    axis: Triple = (0.0, 0.0, 1.0)
+    axis: Triple = (0.0, 0.0, 1.0)  # Unit vector across the grooves, object frame
+    # Distance between grooves, metres; grooves finer than a pixel widen the highlight.
     pitch: float = 0.0002
-    slope: float = 0.3
+    slope: float = 0.3  # Largest slope of a groove's flanks, the tangent of the normal's tilt
+    # 0 for even grooves (layer lines), 1 for random depths and widths (brushing).
     irregularity: float = 0.0
 
 
@@ -51,38 +45,28 @@ NOISE_LIMITS: Final = (0.05, 2.0)  # limits of the noise factor on a material's 
 
 @dataclass(frozen=True)
 class Material:
-    """Reflectance of a surface (Lambert plus GGX, metallic workflow).
+    """Reflectance of a surface (Lambert plus GGX, metallic workflow)."""
 
-    Attributes:
-        colour: Linear albedo in [0, 1] per channel; multiplies the texture or vertex colours.
-        roughness: GGX roughness in (0, 1]; 1 is chalk.
-        specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
-        metallic: 1 for a metal, which has no diffuse reflection and a specular one in its colour.
-        noise: Relative amplitude of the albedo's noise, clipped to :data:`NOISE_LIMITS`.
-        noise_pitch: Distance between the lattice points of the noise, metres.
-    """
-
+    # Linear albedo in [0, 1] per channel; multiplies the texture or vertex colours.
     colour: Triple = (0.6, 0.6, 0.6)
-    roughness: float = 0.6
+    roughness: float = 0.6  # GGX roughness in (0, 1]; 1 is chalk
+    # Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
     specular: float = 0.04
+    # 1 for a metal, which has no diffuse reflection and a specular one in its colour.
     metallic: float = 0.0
-    noise: float = 0.0
-    noise_pitch: float = 0.005
+    noise: float = 0.0  # Relative amplitude of the albedo's noise, clipped to :data:`NOISE_LIMITS`
+    noise_pitch: float = 0.005  # Distance between the lattice points of the noise, metres
     grooves: Grooves | None = None
 
 
 @dataclass(frozen=True)
 class Light:
-    """A point light.
+    """A point light."""
 
-    Attributes:
-        position: Camera frame, metres.
-        intensity: Linear RGB that a white surface facing the light shows at ``reach``.
-        reach: Distance at which a surface has this intensity, metres (inverse-square law).
-    """
-
-    position: Triple
+    position: Triple  # Camera frame, metres
+    # Linear RGB that a white surface facing the light shows at ``reach``.
     intensity: Triple = (0.8, 0.8, 0.8)
+    # Distance at which a surface has this intensity, metres (inverse-square law).
     reach: float = 1.0
 
 
@@ -92,19 +76,13 @@ class Panel:
 
     The radiance in a unit direction with the components a across, b along and c towards the panel
     is ``intensity`` · exp(−½ (a²/width² + b²/length²)), times ½ + 2c limited to 0 … 1.
-
-    Attributes:
-        middle: Unit vector to the panel's middle, camera frame.
-        along: Unit vector of its longer side, perpendicular to ``middle``.
-        width: Standard deviation across the panel, as the sine of an angle.
-        length: Standard deviation along the panel, likewise.
-        intensity: Linear RGB radiance of the middle; a white surface under uniform light has 1.
     """
 
-    middle: Triple
-    along: Triple
-    width: float
-    length: float
+    middle: Triple  # Unit vector to the panel's middle, camera frame
+    along: Triple  # Unit vector of its longer side, perpendicular to ``middle``
+    width: float  # Standard deviation across the panel, as the sine of an angle
+    length: float  # Standard deviation along the panel, likewise
+    # Linear RGB radiance of the middle; a white surface under uniform light has 1.
     intensity: Triple
 
     @property
@@ -152,14 +130,10 @@ class Plane:
     """An unbounded supporting plane, the table.
 
     The scene's background image shows the plane; renderers add the shadows of objects.
-
-    Attributes:
-        normal: Unit normal on the camera's side, camera frame.
-        offset: ``normal · x`` of the plane's points, metres; negative, as the camera is above.
     """
 
-    normal: Triple
-    offset: float
+    normal: Triple  # Unit normal on the camera's side, camera frame
+    offset: float  # ``normal · x`` of the plane's points, metres; negative, as the camera is above
 
     def inverse_depth_row(self, K: CameraMatrix) -> Vector:
         """Return (a, b, c): the plane's point at pixel (u, v) has depth 1/(a u + b v + c) m."""
@@ -188,12 +162,7 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Objects, lights, background and camera of one image.
-
-    Attributes:
-        T_cam_world: Transform to this camera from the world frame, which is the camera frame of the
-            sampled scene (see :meth:`seen_from`).
-    """
+    """Objects, lights, background and camera of one image."""
 
     K: CameraMatrix
     background: RGBImage
@@ -202,6 +171,8 @@ class Scene:
     ambient: Ambient = field(default_factory=Ambient)
     plane: Plane | None = None
     sensor: Sensor = field(default_factory=Sensor)
+    # Transform to this camera from the world frame, which is the camera frame of the sampled scene
+    # (see :meth:`seen_from`).
     T_cam_world: Transform = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -218,10 +189,8 @@ class Scene:
         """Return the static scene as seen by another camera with the same lens and sensor.
 
         The background is warped by the plane's homography or, without a plane, by rotation only.
-        Pixels outside the old image are filled by reflection at its border.
-
-        Args:
-            T_new_cam: Transform from this camera to the other, metres.
+        Pixels outside the old image are filled by reflection at its border. ``T_new_cam`` maps this
+        camera's frame into the other's, metres.
         """
         R, shift = T_new_cam[:3, :3], T_new_cam[:3, 3]
         homography, plane = R, self.plane
@@ -248,14 +217,10 @@ class Scene:
         )
 
     def keypoints(self, index: int) -> Float[np.ndarray, "9 2"]:
-        """Return a target's projected corners and centroid, pixels.
-
-        Raises:
-            ValueError: The object is a distractor.
-        """
+        """Return a target's projected corners and centroid, pixels; distractors have none."""
         item = self.objects[index]
         if item.part is None:
-            raise ValueError(f"object {index} is a distractor and has no {NUM_KEYPOINTS} keypoints")
+            raise ValueError(f"object {index} is a distractor without keypoints")
         return project_keypoints(item.part.cuboid, item.T_cam_obj, self.K)
 
 

@@ -30,24 +30,17 @@ _NOISE_RUN: Final = 1024  # values read in a row; then the hash chooses another 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A camera's effects, applied to the whole image after rendering.
+    """A camera's effects, applied to the whole image after rendering."""
 
-    Attributes:
-        exposure_ev: Exposure in stops; 1 doubles the light.
-        blur_px: Standard deviation of the defocus blur, pixels.
-        motion_px: Displacement (x, y) of the image during the exposure, pixels.
-        read_noise: Standard deviation of signal-independent noise, grey levels of 255.
-        shot_noise: Standard deviation of signal-dependent noise at white, grey levels. It grows
-            with the square root of the signal.
-        jpeg_quality: JPEG quality, 1 to 100; None for no compression.
-    """
-
-    exposure_ev: float = 0.0
-    blur_px: float = 0.0
+    exposure_ev: float = 0.0  # Exposure in stops; 1 doubles the light
+    blur_px: float = 0.0  # Standard deviation of the defocus blur, pixels
+    # Displacement (x, y) of the image during the exposure, pixels.
     motion_px: tuple[float, float] = (0.0, 0.0)
-    read_noise: float = 0.0
+    read_noise: float = 0.0  # Standard deviation of signal-independent noise, grey levels of 255
+    # Standard deviation of signal-dependent noise at white, grey levels. It grows with the square
+    # root of the signal.
     shot_noise: float = 0.0
-    jpeg_quality: int | None = None
+    jpeg_quality: int | None = None  # JPEG quality, 1 to 100; None for no compression
     noise_seed: int = 0
 
 

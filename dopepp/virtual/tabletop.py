@@ -30,15 +30,9 @@ Cell = tuple[int, int]  # x and y
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Sample a view of the table, and add targets and distractors to a composition.
+    """Add targets and distractors on the table to a composition, and return the view T_cam_table.
 
-    Args:
-        composition: Composition of the image, whose generator is used.
-        table: Distribution of the views and resting poses.
-        targets: Targets of the image.
-
-    Returns:
-        T_cam_table (plane z = 0, z up).
+    The plane is z = 0, and z points up. Views and resting poses are sampled from ``table``.
     """
     rng = composition.rng
     # Sample another view if no target fits into the image.
@@ -156,18 +150,14 @@ def draw_view(table: Table, composition: Composition) -> Transform:
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Height maps of a rotated object from below and above, with a border of one cell.
+    """Height maps of a rotated object from below and above, with a border of one cell."""
 
-    Attributes:
-        bottom: Height of the underside above the lowest point, metres; the minimum of a cell and
-            its eight neighbours, to cover the space between centres; infinite outside the object.
-        top: Height of the upper side above the lowest point, metres; −infinite outside the object.
-        corner: x and y of the first cell's centre relative to the object's origin, in cells.
-    """
-
+    # Height of the underside above the lowest point, metres; the minimum of a cell and its eight
+    # neighbours, to cover the space between centres; infinite outside the object.
     bottom: Float32[np.ndarray, "rows columns"]
+    # Height of the upper side above the lowest point, metres; −infinite outside the object.
     top: Float32[np.ndarray, "rows columns"]
-    corner: Cell
+    corner: Cell  # x and y of the first cell's centre relative to the object's origin, in cells
 
 
 class HeightMap:

@@ -96,16 +96,10 @@ def rasterise(
 ) -> None:
     """Draw triangles into buffers of the nearest inverse depth (1/m, 0 = empty) and triangle id.
 
-    Args:
-        hom: Homogeneous pixels of the vertices, shape (V, 3).
-        faces: Triangles.
-        cull: Whether to omit back faces (watertight meshes only).
-        near: Smallest depth of a sample, metres.
-        origin: Pixel (x, y) of the buffers' first element.
-        samples: Offsets of a pixel's samples from its centre, at most 1/4, shape (S, 2).
-        inverse_depth: Buffer of shape (height, width, S).
-        ids: Buffer of shape (height, width, S).
-        first_id: Id of the first triangle.
+    ``hom`` are homogeneous pixels of the vertices, shape (V, 3), and the first of the ``faces`` has
+    the id ``first_id``. With ``cull``, back faces are omitted (watertight meshes only). No sample
+    is nearer than ``near`` metres. ``samples`` are offsets from a pixel's centre, at most 1/4,
+    shape (S, 2). The buffers have the shape (height, width, S) and begin at pixel ``origin``.
     """
     height, width, num_samples = inverse_depth.shape
     x0, y0 = origin

@@ -114,7 +114,7 @@ def test_depth_without_objects_and_unknown_depth():
 
 def test_axes_have_their_ends_and_colours():
     image = np.zeros((60, 80, 3), np.uint8)
-    sheet.draw_axes(image, np.array([[20.0, 30], [70, 30], [20, 5], [20, 55]]), thickness=1)
+    sheet.draw_axes(image, np.array([[20.0, 30], [70, 30], [20, 5], [20, 55]]))
     near_ends = [(60, 30), (20, 8), (20, 50)]
     for (column, row), colour in zip(near_ends, sheet.AXIS_COLOURS, strict=True):
         # An anti-aliased line of one pixel has at least nine tenths of its colour.

@@ -184,20 +184,6 @@ def test_files_of_opencv_are_read_exactly(tmp_path, suffix, four, lens, is_colum
     assert camera.distortion == (tuple(lens) if any(lens) else ())
 
 
-def test_its_lens_projects_like_opencvs(tmp_path):
-    path = tmp_path / "cameras.txt"
-    path.write_text(COLMAP.format("OPENCV 640 480 600 610 320 240 -0.1 0.05 0.001 -0.002"))
-    camera, (x, y) = read_camera(path), (0.2, -0.15)
-    r2 = x * x + y * y
-    radial = 1 - 0.1 * r2 + 0.05 * r2 * r2
-    u = x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x * x)
-    v = y * radial + 0.001 * (r2 + 2 * y * y) - 2 * 0.002 * x * y
-    expected = [600 * u + 320 - 0.5, 610 * v + 240 - 0.5]
-    lens = np.array(camera.distortion)
-    pixel = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), camera.K, lens)[0]
-    assert_allclose(pixel[0, 0], expected, atol=1e-9)
-
-
 BAD = {
     "empty": ("", "without any fields"),
     "text": ("The camera is on the left.", "without any fields"),

@@ -104,13 +104,6 @@ def test_random_rotations_are_uniform():
     assert np.abs(rotations.mean(0)).max() < 0.04
 
 
-def test_a_rotation_is_orthogonal_and_no_mirror():
-    rotation = random_rotation(np.random.default_rng(0))
-    assert is_rotation(rotation)
-    for other in (-rotation, 1.01 * rotation, np.full((3, 3), np.nan), np.eye(4)):
-        assert not is_rotation(other)
-
-
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_the_nearest_rotation_is_the_polar_factor(seed):

@@ -13,21 +13,16 @@ from dopepp.metrics.bootstrap import paired_difference as difference
 Z = norm.ppf(0.975)
 
 
-@pytest.mark.parametrize(
-    ("name", "reference", "confidence"),
-    [("mean", np.mean, 0.8), ("mean", np.mean, 0.99), ("median", np.median, 0.95)],
-)
-def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(name, reference, confidence):
+@pytest.mark.parametrize(("name", "reference"), [("mean", np.mean), ("median", np.median)])
+def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(name, reference):
     rng = np.random.default_rng(11)
     mine, other = rng.gamma(2, 5, 121), rng.gamma(2, 6, 121)
     mine = 0.6 * mine + 0.4 * other
-    result = difference(
-        [mine[None]], [other[None]], name, num_resamples=20_000, confidence=confidence, seed=5
-    )
+    result = difference([mine[None]], [other[None]], name, num_resamples=20_000, seed=5)
     expected = bootstrap(
         (mine, other),
         lambda x, y, axis=-1: reference(x, axis=axis) - reference(y, axis=axis),
-        paired=True, n_resamples=20_000, method="percentile", confidence_level=confidence,
+        paired=True, n_resamples=20_000, method="percentile", confidence_level=0.95,
         rng=np.random.default_rng(6),
     ).confidence_interval  # fmt: skip
     assert result.value == pytest.approx(reference(mine) - reference(other), abs=1e-12)

@@ -91,9 +91,9 @@ def test_vsd_is_its_definition(x, z):
     measured = np.where(rng.random(SIZE[::-1]) < 0.2, 0.0, 0.5 + 0.03 * rng.normal(size=SIZE[::-1]))
     measured[20:24] = 0.4  # an object in front of both
     estimated, true = drawn(pose(x, z=z)), drawn(pose())
-    tolerances = (0.05, 0.2, 0.5)
-    result = vsd(estimated, true, measured, K, 0.1, tolerances=tolerances)
-    np.testing.assert_allclose(result, vsd_loop(estimated, true, measured, 0.1, tolerances))
+    result = vsd(estimated, true, measured, K, 0.1)
+    expected = vsd_loop(estimated, true, measured, 0.1, np.arange(1, 11) / 20)
+    np.testing.assert_allclose(result, expected)
 
 
 def test_vsd_of_an_invisible_object_is_one():

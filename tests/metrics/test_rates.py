@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest, chi2
 
-from dopepp.core.errors import UserError
 from dopepp.metrics.functional import (
     BOP_MSPD_THRESHOLDS,
     BOP_THRESHOLDS,
@@ -17,7 +16,6 @@ from dopepp.metrics.functional import (
     average_precision,
     average_recall,
     coverage,
-    expected_calibration_error,
     match,
     pass_rate,
     region_levels,
@@ -60,22 +58,16 @@ def test_auc_equals_loops(errors):
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "message"),
+    ("call", "message"),
     [
-        (lambda: auc(ONES, 0.1, "coco"), UserError, "got auc method 'coco'; allowed: exact, voc"),
-        (lambda: auc(ONES, 0), UserError, "got max_threshold=0"),
-        (lambda: average_recall(ONES, []), UserError, "no thresholds"),
-        (lambda: match(ONES, torch.zeros(3, 1), 0.1), ValueError, "2 scores need as many rows"),
-        (lambda: average_precision(ONES, TRUE, 1), ValueError, "2 correct predictions of 1"),
-        (lambda: average_precision(ONES, TRUE[:1], 1), ValueError, "differ"),
-        (lambda: expected_calibration_error(1.5 * ONES, TRUE), ValueError, r"\[0, 1\]"),
-        (lambda: expected_calibration_error(ONES * NAN, TRUE), ValueError, r"\[0, 1\]"),
-        (lambda: expected_calibration_error(ONES, TRUE[:1]), ValueError, "bins"),
+        (lambda: match(ONES, torch.zeros(3, 1), 0.1), "2 scores need as many rows"),
+        (lambda: average_precision(ONES, TRUE, 1), "2 correct predictions of 1"),
+        (lambda: average_precision(ONES, TRUE[:1], 1), "differ"),
     ],
-    ids=["method", "range", "thresholds", "rows", "too many", "lengths", "above 1", "NaN", "bins"],
+    ids=["rows", "too many", "lengths"],
 )
-def test_wrong_arguments_are_refused(call, error, message):
-    with pytest.raises(error, match=message):
+def test_wrong_arguments_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
         call()
 
 
@@ -150,41 +142,16 @@ def test_average_recall_is_the_mean_of_strict_pass_rates():
 
 
 @settings(max_examples=100)
-@given(
-    counts=st.integers(0, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))),
-    confidence=st.floats(0.5, 0.999),
-)
-def test_wilsons_interval_is_scipys(counts, confidence):
+@given(st.integers(0, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilsons_interval_is_scipys(counts):
     passed, num = counts
-    low, high = wilson_interval(passed, num, confidence)
+    low, high = wilson_interval(passed, num)
     if num == 0:  # without trials the rate is unknown
         assert (low, high) == (0.0, 1.0)
         return
-    theirs = binomtest(passed, num).proportion_ci(confidence, method="wilson")
+    theirs = binomtest(passed, num).proportion_ci(0.95, method="wilson")
     assert (low, high) == pytest.approx((theirs.low, theirs.high), abs=1e-9)
     assert 0 <= low <= passed / num <= high <= 1
-
-
-@settings(max_examples=50)
-@given(seed=st.integers(0, 10_000), count=st.integers(1, 60), bins=st.integers(1, 20))
-def test_calibration_error_is_its_definition(seed, count, bins):
-    rng = np.random.default_rng(seed)
-    scores, correct = rng.integers(0, 41, count) / 40, rng.random(count) < 0.5
-    expected = 0.0
-    for k in range(bins):
-        inside = (scores * bins > k) & (scores * bins <= k + 1)
-        if k == 0:
-            inside |= scores == 0
-        if inside.any():
-            expected += inside.mean() * abs(scores[inside].mean() - correct[inside].mean())
-    result = expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct), bins)
-    assert result == pytest.approx(expected, abs=1e-12)
-
-
-def test_calibration_error_of_extreme_scores():
-    assert expected_calibration_error(ONES[:0], TRUE[:0]) == 0.0
-    assert expected_calibration_error(ONES, TRUE) == 0.0
-    assert expected_calibration_error(ONES, ~TRUE) == 1.0
 
 
 @settings(max_examples=60)

@@ -11,14 +11,14 @@ from PIL import Image
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_picture
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual import Factory, Preset, preset_of
+from dopepp.virtual import Factory
 from dopepp.virtual.backgrounds import (
     PhotoBackgrounds,
     ProceduralBackgrounds,
     find_backgrounds,
-    procedural,
 )
 from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
+from dopepp.virtual.presets import Preset, preset_of
 
 
 def write_photos(folder, count, side=40):
@@ -246,32 +246,6 @@ def test_clutter_depends_on_the_generator_only_and_keeps_uncovered_pixels(size):
         np.testing.assert_array_equal(image, again)
         plain = behind.draw(np.random.default_rng(seed), *size)
         assert min(size) < 4 or 0.05 < (image == plain).all(axis=2).mean() < 0.98
-
-
-def test_clutter_has_edges_between_the_pixels(monkeypatch):
-    monkeypatch.setattr(procedural, "_PLAIN_SHARE", 1.0)
-    monkeypatch.setattr(procedural, "_plain", lambda _, *size: np.full((*size[::-1], 3), 255, "u1"))
-    clutter = ClutteredBackgrounds(Grey(), (5, 5))
-    for seed in range(10):
-        image = clutter.draw(np.random.default_rng(seed), 128, 128)[..., 0]
-        inside, between = image == 255, (image > 77) & (image < 255)
-        assert inside.any()
-        # Outlines are blended over fewer than two pixels.
-        rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3))) - inside
-        assert 0.3 * rim.sum() < between.sum() < 3 * rim.sum()
-
-
-def test_printed_pieces_have_cells_of_a_dark_and_a_light_colour():
-    spreads, upright = [], 0
-    for seed in range(60):
-        image = procedural._printed(np.random.default_rng(seed), 64, 48)[..., 0].astype(int)
-        low, high = image.min(), image.max()
-        spreads.append(high - low)
-        # All but the pixels between two cells, of at most 8 by 8.
-        assert (np.minimum(image - low, high - image) <= 3).mean() > 0.6
-        upright += (np.diff(image, axis=0) == 0).all() or (np.diff(image, axis=1) == 0).all()
-    assert np.mean(np.array(spreads) > 45) > 0.85  # but for a single cell, and few of one colour
-    assert upright < 10
 
 
 def test_a_backgrounds_contrast_is_changed_about_its_mean():

@@ -8,10 +8,11 @@ import pytest
 import dopepp.core.errors
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, transform
-from dopepp.virtual import Factory, heap, visible_fractions
+from dopepp.virtual import Factory, heap
 from dopepp.virtual.presets import preset_of
 from dopepp.virtual.presets.table import Pile
 from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.renderers.raster import visible_fractions
 from tests.virtual.conftest import draw_scenes
 
 BOX = np.array([0.10, 0.06, 0.02])  # sides of ``box_part``
@@ -183,15 +184,6 @@ def test_a_heap_that_reaches_the_camera_is_shown_without_its_top(box_part):
         targets = in_table_frame(scene)
         assert 0 < len(targets) < 30
         assert max(pose[2, 3] for pose in targets) < 0.12
-
-
-def test_both_renderers_draw_a_heap(heaps):
-    scene = heaps[0]
-    fractions = find_renderer("raster")(scene).visible_fractions
-    pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
-    pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
-    traced = find_renderer("photoreal")(scene)
-    np.testing.assert_allclose(traced.visible_fractions, fractions, atol=0.05)
 
 
 def test_a_missing_extra_is_named_in_one_line(box_part, monkeypatch):

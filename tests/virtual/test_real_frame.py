@@ -9,7 +9,8 @@ from scipy.io import loadmat
 
 from dopepp.geometry.camera import make_transform
 from dopepp.parts.mesh.read import ycb_part
-from dopepp.virtual import Material, Scene, SceneObject, make_surface, render
+from dopepp.virtual import Scene, SceneObject, make_surface, render
+from dopepp.virtual.scene import Material
 
 CLASSES = {2: "003_cracker_box", 4: "005_tomato_soup_can", 5: "006_mustard_bottle"}
 

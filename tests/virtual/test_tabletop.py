@@ -10,7 +10,8 @@ import trimesh
 from dopepp.geometry.camera import transform
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import make_part
-from dopepp.virtual import Distractors, Factory
+from dopepp.virtual import Factory
+from dopepp.virtual.body import Distractors
 from dopepp.virtual.presets import PRESETS, preset_of
 from dopepp.virtual.tabletop import HeightMap
 from tests.virtual.conftest import draw_scenes

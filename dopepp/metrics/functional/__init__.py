@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dopepp.core.errors import UserError
 from dopepp.metrics.functional.distances import BOP_MSPD_THRESHOLDS as BOP_MSPD_THRESHOLDS
 from dopepp.metrics.functional.distances import BOP_THRESHOLDS as BOP_THRESHOLDS
 from dopepp.metrics.functional.distances import VSD_DELTA as VSD_DELTA
@@ -41,31 +40,15 @@ AucMethod = Literal["exact", "voc"]
 def auc(errors: Errors, max_threshold: float, method: AucMethod = "exact") -> float:
     """Return the area under the accuracy-threshold curve from 0 to ``max_threshold``, in [0, 1].
 
-    Args:
-        errors: Errors in the unit of ``max_threshold``; infinite or NaN for a miss.
-        max_threshold: End of the curve, e.g. 0.1 m.
-        method: ``exact`` integrates the step curve: mean(clip(1 − e / max, 0, 1)). ``voc`` is the
-            rule of the YCB-Video toolbox, which is larger by eₖ / (N·max):
-            (Σ (eᵢ − eᵢ₋₁)·i + (max − eₖ)·k) / (N·max) over the k of N sorted errors ≤ max, e₀ = 0.
-
-    Returns:
-        The area; 0.0 without errors.
-
-    Raises:
-        UserError: The method is unknown or ``max_threshold`` is not positive.
+    An infinite or NaN error is a miss. ``exact`` integrates the step curve:
+    mean(clip(1 − e / max, 0, 1)). ``voc`` is the rule of the YCB-Video toolbox, which is larger by
+    eₖ / (N·max): (Σ (eᵢ − eᵢ₋₁)·i + (max − eₖ)·k) / (N·max) over the k of N sorted errors ≤ max,
+    e₀ = 0. Without errors, the area is 0.
     """
-    if not max_threshold > 0:
-        raise UserError(
-            f"max_threshold={max_threshold}",
-            "a positive number",
-            "pass the error at which the curve ends, e.g. 0.1",
-        )
     errors = nan_is_miss(to_float64(errors))
     if method == "exact":
         values = (1 - errors / max_threshold).clamp(0, 1)
         return float(values.mean()) if len(values) else 0.0
-    if method != "voc":
-        raise UserError(f"auc method {method!r}", "exact, voc", "pass method='exact' or 'voc'")
     hits = errors[errors <= max_threshold].sort().values
     if len(hits) == 0:
         return 0.0
@@ -86,24 +69,19 @@ def average_recall(errors: Errors, thresholds: Sequence[float]) -> float:
 
     AR_MSSD uses :data:`BOP_THRESHOLDS` times the diameter, AR_MSPD :data:`BOP_MSPD_THRESHOLDS`
     times width/640.
-
-    Raises:
-        UserError: There are no thresholds.
     """
-    if not len(thresholds):
-        raise UserError("no thresholds", "at least one threshold", "pass e.g. BOP_THRESHOLDS")
     return sum(pass_rate(errors, threshold) for threshold in thresholds) / len(thresholds)
 
 
-def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return Wilson's score interval of the rate ``passed / num`` (Wilson 1927).
+def wilson_interval(passed: int, num: int) -> tuple[float, float]:
+    """Return Wilson's 95 % score interval of the rate ``passed / num`` (Wilson 1927).
 
     With z the two-sided normal quantile and p the rate, the ends are
     (p + z²/2n ± z·√(p(1 − p)/n + z²/4n²)) / (1 + z²/n); without trials they are 0 and 1.
     """
     if num == 0:
         return 0.0, 1.0
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    z = NormalDist().inv_cdf(0.975)
     rate, weight = passed / num, z * z / num
     centre = (rate + weight / 2) / (1 + weight)
     half = math.sqrt(rate * (1 - rate) * weight + weight * weight / 4) / (1 + weight)
@@ -127,33 +105,6 @@ def coverage(distances: Errors, level: float = 0.9) -> float:
     """Return the share of Mahalanobis distances inside a confidence region; 0.0 without any."""
     levels = region_levels(distances)
     return float((levels <= level).double().mean()) if len(levels) else 0.0
-
-
-def expected_calibration_error(
-    scores: Float[Tensor, "p"], correct: Bool[Tensor, "p"], bins: int = 10
-) -> float:
-    """Return the mean gap between score and share of correct predictions (ECE; Guo 2017, Eq. 3).
-
-    Predictions are sorted into bins of equal width by score, and bins are weighted by size. A score
-    on an edge belongs to the lower bin. Without predictions the error is 0.0.
-
-    Raises:
-        ValueError: The lengths differ, a score is outside [0, 1], or there are no bins.
-    """
-    scores, correct = to_float64(scores), torch.as_tensor(correct, dtype=torch.bool)
-    if scores.shape != correct.shape or scores.ndim != 1 or bins < 1:
-        raise ValueError(
-            f"scores {tuple(scores.shape)} and correct {tuple(correct.shape)} in {bins} bins"
-        )
-    if len(scores) == 0:
-        return 0.0
-    if not bool(((scores >= 0) & (scores <= 1)).all()):
-        raise ValueError("scores must lie in [0, 1]")
-    index = ((scores * bins).ceil().long() - 1).clamp(min=0)
-    zeros = scores.new_zeros(bins)
-    confidence = zeros.index_add(0, index, scores)
-    accuracy = zeros.index_add(0, index, correct.double())
-    return float((confidence - accuracy).abs().sum() / len(scores))
 
 
 _RECALLS: Final = torch.from_numpy(np.linspace(0.0, 1.0, 101))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,7 @@ Errors = Float[Tensor, "n"]
 """N poses and their errors (infinite for a miss), V points of one object; metres."""
 
 BOP_THRESHOLDS: Final = tuple(round(0.05 * k, 2) for k in range(1, 11))
-"""Thresholds of MSSD in diameters, 0.05 to 0.5 (BOP)."""
+"""Thresholds of MSSD, and tolerances of VSD, in diameters, 0.05 to 0.5 (BOP)."""
 
 BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
 """Thresholds of MSPD in pixels of a 640-pixel-wide image, 5 to 50 (BOP)."""
@@ -133,9 +133,7 @@ def mspd(
     arguments are as in :func:`mssd`.
     """
     R_est, t_est, R_gt, t_gt, points = _checked(R_est, t_est, R_gt, t_gt, points)
-    # The last row of K is replaced, so that the projection always divides by the point's depth.
-    to_pixels = _check_cameras(K, len(R_est)).clone()
-    to_pixels[:, 2] = to_pixels.new_tensor([0.0, 0.0, 1.0])
+    to_pixels = _check_cameras(K, len(R_est))
     estimated, true = (
         (to_pixels @ R, (to_pixels @ t[..., None])[..., 0])
         for R, t in ((R_est, t_est), (R_gt, t_gt))
@@ -290,38 +288,27 @@ def nan_is_miss(errors: Tensor) -> Tensor:
 
 
 def vsd(
-    depth_est: Depths,
-    depth_gt: Depths,
-    depth: Depths,
-    K: CameraMatrix,
-    diameter: float,
-    delta: float = VSD_DELTA,
-    tolerances: Sequence[float] = BOP_THRESHOLDS,
-) -> Float[np.ndarray, "tolerances"]:
-    """Return the visible surface discrepancy in [0, 1] for each tolerance (VSD; BOP 2019).
+    depth_est: Depths, depth_gt: Depths, depth: Depths, K: CameraMatrix, diameter: float
+) -> Float[np.ndarray, "10"]:
+    """Return the visible surface discrepancy in [0, 1] for BOP's tolerances (VSD; BOP 2019).
 
     A pixel is wrong if it shows the object at one pose only. It is also wrong if the distances of
     the surface from the camera at both poses differ by at least the tolerance.
 
-    Args:
-        depth_est: Rendered depth at the estimated pose, metres along z, 0 outside the object.
-        depth_gt: Rendered depth at the true pose, metres.
-        depth: Measured depth, metres; 0 without a measurement, where every surface is visible.
-        K: Camera matrix, pixels.
-        diameter: Diameter of the object, metres.
-        delta: Largest distance of a visible surface behind the measured depth, metres.
-        tolerances: Tolerances in diameters.
+    ``depth_est`` and ``depth_gt`` are rendered at both poses, metres along z, 0 outside the object;
+    ``depth`` is measured, 0 without a measurement, where every surface is visible. Tolerances are
+    :data:`BOP_THRESHOLDS` times the diameter, metres.
     """
     rays = _ray_lengths(K, depth.shape)
     measured, estimated, true = rays * depth, rays * depth_est, rays * depth_gt
-    visible_gt = _is_visible(true, measured, delta)
-    visible_est = _is_visible(estimated, measured, delta) | (visible_gt & (estimated > 0))
+    visible_gt = _is_visible(true, measured)
+    visible_est = _is_visible(estimated, measured) | (visible_gt & (estimated > 0))
     either, both = visible_gt | visible_est, visible_gt & visible_est
     num_either = int(either.sum())
     if not num_either:
-        return np.ones(len(tolerances))
+        return np.ones(len(BOP_THRESHOLDS))
     gaps = np.abs(true - estimated)[both] / diameter
-    wrong = [int((gaps >= tolerance).sum()) for tolerance in tolerances]
+    wrong = [int((gaps >= tolerance).sum()) for tolerance in BOP_THRESHOLDS]
     return np.array([(n + num_either - int(both.sum())) / num_either for n in wrong])
 
 
@@ -332,8 +319,6 @@ def _ray_lengths(K: CameraMatrix, shape: tuple[int, ...]) -> Depths:
     return np.asarray(np.linalg.norm(rays / rays[2], axis=0).reshape(shape))
 
 
-def _is_visible(
-    distance: Depths, measured: Depths, delta: float
-) -> Bool[np.ndarray, "height width"]:
+def _is_visible(distance: Depths, measured: Depths) -> Bool[np.ndarray, "height width"]:
     """Return where a surface is visible: not behind the measured depth, or depth is missing."""
-    return np.asarray((distance > 0) & ((distance - measured <= delta) | (measured == 0)))
+    return np.asarray((distance > 0) & ((distance - measured <= VSD_DELTA) | (measured == 0)))

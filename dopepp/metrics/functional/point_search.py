@@ -155,11 +155,7 @@ def _mean_distance(
 
 
 def least_farthest(
-    estimated: Affine,
-    true: Affine,
-    points: Float[Tensor, "v 3"],
-    symmetries: Affine,
-    perspective: bool,
+    estimated: Affine, true: Affine, points: Tensor, symmetries: Affine, perspective: bool
 ) -> Float[Tensor, "n"]:
     """Return the maximum point distance under the best symmetry (MSSD, MSPD).
 

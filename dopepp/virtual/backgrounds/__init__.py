@@ -46,12 +46,10 @@ class Backgrounds(Protocol):
 
 
 def find_backgrounds(choice: str | Path | None, split: PhotoSplit = "all") -> Backgrounds:
-    """Return the backgrounds that a user selects.
+    """Return the backgrounds that a user selects, or one ``split`` of the photos.
 
-    Args:
-        choice: None or ``procedural`` for textures, which need no files; ``skimage`` for the photos
-            in scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
-        split: Split of the photos (:meth:`PhotoBackgrounds.part`).
+    A choice is None or ``procedural`` for textures, which need no files; ``skimage`` for the photos
+    in scikit-image; or a folder of photos (``./skimage`` for a folder of that name).
 
     Raises:
         UserError: The folder is missing or contains no photo, or scikit-image is not installed.

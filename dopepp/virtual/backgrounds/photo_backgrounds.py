@@ -33,9 +33,7 @@ _MIN_REDUCTION: Final = 2.0
 PhotoSplit = Literal["train", "val", "test", "all"]
 
 MIN_PHOTOS: Final = 2  # smallest number of photos in the validation split and in the test split
-HELD_OUT: Final = 0.15
-"""Share of the photos in the validation split, and in the test split."""
-
+HELD_OUT: Final = 0.15  # Share of the photos in the validation split, and in the test split
 _HASHED_BYTES: Final = 2**16  # leading bytes of a photo, whose hash determines the split
 
 _SMALLEST_PX: Final = 30  # smallest valid shorter side of a halving
@@ -48,10 +46,8 @@ class PhotoBackgrounds:
     A damaged photo is logged and replaced by another random photo, so an image depends only on the
     generator and the files.
 
-    Args:
-        folder: Folder to search recursively for :data:`PHOTO_SUFFIXES`, without hidden files and
-            links to folders. Photos are sorted by relative path.
-        names: Relative paths of the photos, instead of a search.
+    A folder is searched recursively for :data:`PHOTO_SUFFIXES`, without hidden files and links to
+    folders, unless ``names`` gives the photos' relative paths. Photos are sorted by relative path.
 
     Raises:
         UserError: The folder contains no photo; or, in :meth:`draw` and :meth:`frame`, more than 10
@@ -89,10 +85,7 @@ class PhotoBackgrounds:
         Photos are divided by the order of their content's hashes. Splits therefore do not depend on
         names or folders, and copies of a photo are in the same split. With fewer than six different
         photos, all splits are the whole folder (:meth:`is_divided` is False).
-
-        Args:
-            split: Split to return; ``all`` for the whole folder.
-            held_out: Share of the photos in the validation split, and in the test split.
+        ``held_out`` is the share of the photos in the validation split, and in the test split.
         """
         if split == "all":
             return self
@@ -142,12 +135,9 @@ class PhotoBackgrounds:
     ) -> tuple[RGBImage, Path]:
         """Return a region of a photo, scaled to ``size``, and the photo's path.
 
-        Args:
-            rng: Generator of the region's position; unused for the largest region.
-            number: Index of the photo; a damaged photo is replaced by the next.
-            size: (width, height) of the returned image, pixels.
-            share: Ratio of the region's side to the largest side at this aspect ratio.
-            mirrored: Whether to flip left and right.
+        A damaged photo is replaced by the next after ``number``. ``share`` is the ratio of the
+        region's side to the largest side at this aspect ratio; regions below 1 have a random
+        position. ``mirrored`` flips left and right.
 
         Raises:
             UserError: More than 10 photos or more than 1 % of all photos are damaged.

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 from numpy.random import Generator
 
+from dopepp.core.validation import Pair
 from dopepp.drawing.pictures import RGBImage
 
 if TYPE_CHECKING:
@@ -207,17 +208,12 @@ _FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 class ClutteredBackgrounds:
     """Backgrounds with pieces of other images: polygons, rotated boxes, ellipses and rings.
 
-    Args:
-        behind: Backgrounds, from which some of the pieces are cut as well.
-        number: Smallest and largest number of pieces.
-        contrast: Smallest and largest factor on the whole image's contrast, about its mean.
+    Some pieces are cut from ``behind``. ``number`` limits the number of pieces, and ``contrast``
+    the factor on the whole image's contrast, about its mean.
     """
 
     def __init__(
-        self,
-        behind: Backgrounds,
-        number: tuple[int, int],
-        contrast: tuple[float, float] = (1.0, 1.0),
+        self, behind: Backgrounds, number: tuple[int, int], contrast: Pair = (1.0, 1.0)
     ) -> None:
         self.behind, self.number, self.contrast = behind, number, contrast
 

@@ -168,8 +168,7 @@ class _Presets(Mapping[str, Preset]):
         return len(_NAMES)
 
 
-PRESETS: Final[Mapping[str, Preset]] = _Presets()
-"""Shipped presets by name."""
+PRESETS: Final[Mapping[str, Preset]] = _Presets()  # Shipped presets by name
 
 
 def preset_of(name: str, changes: object = None, where: str = "") -> Preset:

@@ -228,11 +228,7 @@ class FillPlacement(_Placement):
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Sample the object's origin in the camera frame, metres.
 
-        Args:
-            rng: Random generator.
-            K: Camera matrix, pixels.
-            size: (width, height) of the image.
-            rotated_hull: Vertices of the object's convex hull relative to its origin, camera axes.
+        ``rotated_hull`` has the vertices of the convex hull relative to the origin, camera axes.
         """
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)

@@ -126,18 +126,13 @@ class Table(Checked):
 
 @dataclass(frozen=True, eq=False)
 class TableImage:
-    """The image on the plane, and the surroundings beyond the plane's end.
-
-    Attributes:
-        image_table: Homography from (x, y) in the table frame, metres, to the image's pixels.
-        end: Depth at which the plane ends, metres.
-        surroundings: Camera image beyond the end; None if the end is out of view.
-    """
+    """The image on the plane, and the surroundings beyond the plane's end."""
 
     image: RGBImage
+    # Homography from (x, y) in the table frame, metres, to the image's pixels.
     image_table: Float[np.ndarray, "3 3"]
-    end: float
-    surroundings: RGBImage | None
+    end: float  # Depth at which the plane ends, metres
+    surroundings: RGBImage | None  # Camera image beyond the end; None if the end is out of view
 
     def project(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> RGBImage:
         """Return the camera image of the empty plane."""

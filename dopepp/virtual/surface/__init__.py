@@ -33,30 +33,22 @@ _MAX_CORNERS: Final = 1024  # most triangles at a vertex with averaged normals (
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles for the renderers; positions in the object frame, metres.
+    """Triangles for the renderers; positions in the object frame, metres."""
 
-    Attributes:
-        vertices: float64; ``faces`` are their indices, int32.
-        normals: Unit normal of every face's corner, object frame, float32.
-        patches: Index of every face's smooth patch, int32: faces that connect without a crease.
-        uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
-        colours: Linear albedo per vertex; shape (0, 3) without colours or with a texture.
-        closed: Whether it is watertight with outward winding, so that back faces can be omitted.
-        hull: Extreme vertices that bound the mesh's image.
-        points: Points spread evenly over the surface, about ``spacing`` apart.
-    """
-
-    vertices: Vertices
+    vertices: Vertices  # float64; ``faces`` are their indices, int32
     faces: Faces
-    normals: Corners
+    normals: Corners  # Unit normal of every face's corner, object frame, float32
+    # Index of every face's smooth patch, int32: faces that connect without a crease.
     patches: Int[np.ndarray, "faces"]
+    # Texture coordinates per vertex, v up; shape (0, 2) without a texture.
     uv: Float[np.ndarray, "uvs 2"]
+    # Linear albedo per vertex; shape (0, 3) without colours or with a texture.
     colours: Float32[np.ndarray, "colours 3"]
     texture: Texture | None
     sky: OpenSky
-    closed: bool
-    hull: Float[np.ndarray, "hull 3"]
-    points: Points
+    closed: bool  # Whether it is watertight with outward winding, so that back faces can be omitted
+    hull: Float[np.ndarray, "hull 3"]  # Extreme vertices that bound the mesh's image
+    points: Points  # Points spread evenly over the surface, about ``spacing`` apart
     spacing: float
 
     @property

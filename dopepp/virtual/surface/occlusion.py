@@ -35,21 +35,15 @@ class _Points(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OpenSky:
-    """Cosine-weighted share of each point's hemisphere that the mesh itself does not hide.
+    """Cosine-weighted share of each point's hemisphere that the mesh itself does not hide."""
 
-    Attributes:
-        steps: Number of grid steps along the edges of every triangle.
-        firsts: Index of the first point of every triangle's grid.
-        values: Shares at all points, on the front sides, then on the back sides.
-    """
-
-    steps: Int[np.ndarray, "faces"]
-    firsts: Int[np.ndarray, "faces"]
+    steps: Int[np.ndarray, "faces"]  # Number of grid steps along the edges of every triangle
+    firsts: Int[np.ndarray, "faces"]  # Index of the first point of every triangle's grid
+    # Shares at all points, on the front sides, then on the back sides.
     values: Float[np.ndarray, "2 points"]
 
 
-_BAKED: Final[dict[bytes, OpenSky]] = {}
-"""Results of this process, by a hash of the mesh."""
+_BAKED: Final[dict[bytes, OpenSky]] = {}  # Results of this process, by a hash of the mesh
 
 
 def bake_open_sky(

@@ -30,14 +30,10 @@ _SHARPNESS: Final = 0.75  # a probe's width in footprint widths; interpolation w
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """The image pyramid of a texture: levels of half the size each, down to one texel.
+    """The image pyramid of a texture: levels of half the size each, down to one texel."""
 
-    Attributes:
-        texels: RGB of all levels, row by row, uint8, shape (n, 3).
-        levels: First texel, rows and columns of every level, shape (levels, 3).
-    """
-
-    texels: UInt8[np.ndarray, "texels 3"]
+    texels: UInt8[np.ndarray, "texels 3"]  # RGB of all levels, row by row, uint8, shape (n, 3)
+    # First texel, rows and columns of every level, shape (levels, 3).
     levels: Int[np.ndarray, "levels 3"]
 
     def image(self, level: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
@@ -151,13 +147,9 @@ def sample_texture(
 ) -> None:
     """Sample the texture at an object's fragments, filtered over each pixel's footprint.
 
-    Args:
-        points: Fields ``face``, ``share``, ``x`` and ``y`` of the fragments.
-        hom: Homogeneous pixels of the vertices.
-        faces: Triangles.
-        uv: Texture coordinates of the vertices.
-        texture: Texels and levels of a :class:`Texture`, and the table from sRGB codes.
-        out: Filled with linear RGB, shape (3, n).
+    ``points`` are the fragments' ``face``, ``share``, ``x`` and ``y``, ``hom`` the homogeneous
+    pixels of the vertices, and ``texture`` the texels, levels and table from sRGB codes. ``out``
+    (3, n) is filled with linear RGB.
     """
     face, share, x, y = points
     texels, levels, decode = texture

@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.virtual import (
+from dopepp.virtual import make_surface
+from dopepp.virtual.body import Distractors
+from dopepp.virtual.presets.looks import Lighting, Materials, black_body_rgb
+from dopepp.virtual.presets.placement import (
     DistancePlacement,
-    Distractors,
     FacingTurning,
     FillPlacement,
-    Lighting,
-    Materials,
     OffsetPlacement,
-    Table,
-    make_surface,
 )
-from dopepp.virtual.presets.looks import black_body_rgb
+from dopepp.virtual.presets.table import Table
 
 
 def planck_rgb(temperature):

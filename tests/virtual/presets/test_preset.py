@@ -11,7 +11,8 @@ from scipy.stats import kstest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import is_rotation, random_rotation
-from dopepp.virtual import PRESETS, Distractors, Factory, Table, visible_fractions
+from dopepp.virtual import PRESETS, Factory
+from dopepp.virtual.body import Distractors
 from dopepp.virtual.presets import preset_of, resolve_base
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
@@ -21,6 +22,8 @@ from dopepp.virtual.presets.placement import (
     UprightTurning,
     WorkingPlacement,
 )
+from dopepp.virtual.presets.table import Table
+from dopepp.virtual.renderers.raster import visible_fractions
 from tests.virtual.conftest import draw_scenes
 
 

@@ -16,9 +16,7 @@ from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.presets.view import MIN_PX, View, read_lens
 from tests.virtual.conftest import draw_scenes
 
-FOCAL = 640 / math.tan(math.radians(69 / 2))
-"""Of 1280 pixels that show 69°."""
-
+FOCAL = 640 / math.tan(math.radians(69 / 2))  # Of 1280 pixels that show 69°
 K = camera_matrix(FOCAL, FOCAL, 650.0, 350.0)
 
 

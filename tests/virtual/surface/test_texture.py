@@ -7,8 +7,9 @@ import pytest
 
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.virtual import Material, SceneObject, make_surface, render
+from dopepp.virtual import SceneObject, make_surface, render
 from dopepp.virtual.presets.placement import FACING
+from dopepp.virtual.scene import Material
 from dopepp.virtual.sensor import decode_srgb, encode_srgb
 from dopepp.virtual.surface.texture import make_texture
 from tests.virtual.conftest import even_light

@@ -218,18 +218,14 @@ class Film:
     """A film with square pixels, as Mitsuba requires, over a window of the image.
 
     The film's pixels are at least as fine as the image's; non-square pixels are resampled.
-
-    Attributes:
-        size: (width, height) of the film, pixels.
-        focal_px: Focal length, pixels of the film.
-        centre_px: Principal point; pixel (0, 0) is the centre of the film's first pixel.
-        film_from_window: Affine map, 2×3, from the window's pixels to the film's.
     """
 
     window: Box
-    size: Size
-    focal_px: float
+    size: Size  # (width, height) of the film, pixels
+    focal_px: float  # Focal length, pixels of the film
+    # Principal point; pixel (0, 0) is the centre of the film's first pixel.
     centre_px: tuple[float, float]
+    # Affine map, 2×3, from the window's pixels to the film's.
     film_from_window: Float[np.ndarray, "2 3"]
 
     def sensor(self, mi: Any, samples: int) -> dict[str, Any]:

@@ -135,12 +135,8 @@ class Tracer:
     ) -> Float32[np.ndarray, "film_height film_width 4"]:
         """Render the scene by path tracing, and denoise it.
 
-        Args:
-            world: Mitsuba's description of the objects; lights are added.
-            film: The pixels to render.
-
-        Returns:
-            Per pixel, the linear radiance (RGB) and the share that objects cover.
+        Lights are added to ``world``, Mitsuba's description of the objects. The result is, per
+        pixel, the linear radiance (RGB) and the share that objects cover.
         """
         lit = {**world, **make_surroundings(self._mi, self._scene)}
         traced = self._measure(lit, film, _PATHS, SAMPLES_PER_PIXEL)
@@ -286,10 +282,8 @@ def darken(image: RGBImage, light_share: Colours) -> RGBImage:
 def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:
     """Denoise an image in linear light.
 
-    Args:
-        colour: The image, float32 like the guides.
-        albedo: Share of light that the surface scatters, in [0, 1].
-        normal: Unit vectors in any frame, 0 on the background.
+    The guides are ``albedo``, the share of light that the surface scatters, and ``normal``, unit
+    vectors in any frame, 0 on the background. All images are float32.
 
     Raises:
         RuntimeError: The library fails.

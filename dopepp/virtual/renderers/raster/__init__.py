@@ -60,16 +60,12 @@ def render(scene: Scene) -> Rendered:
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """The pixels of an unoccluded object.
+    """The pixels of an unoccluded object."""
 
-    Attributes:
-        mask: Whether each image pixel shows the object.
-        num_px: Number of pixels on an unbounded canvas; infinite if the object reaches the camera.
-        box: Bounds of the pixels, possibly beyond the image; None if it is behind the camera.
-    """
-
-    mask: Mask
+    mask: Mask  # Whether each image pixel shows the object
+    # Number of pixels on an unbounded canvas; infinite if the object reaches the camera.
     num_px: float
+    # Bounds of the pixels, possibly beyond the image; None if it is behind the camera.
     box: Box | None
 
 

@@ -17,40 +17,27 @@ from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, edge_functions, scratch
 
 _DEPTH_GAP: Final = 0.01  # samples of a patch whose depths differ by more hide one another
+Groups = tuple[Array, ...]  # the first fields of :class:`Fragments`
 Mesh = tuple[Array, Array, Array]  # vertices, faces and corner normals
 
 _ALL_BUT_FIRST: Final = 0b1110  # bits of the samples to skip when all of a pixel are alike
 
 
 class Fragments(NamedTuple):
-    """An object's n visible fragments: arrays that the shading passes read and update.
+    """An object's n visible fragments: arrays that the shading passes read and update."""
 
-    Attributes:
-        pixel: Index of the pixel in the window, row by row, shape (n,).
-        weight: Number of the pixel's samples in the fragment, shape (n,).
-        face: Index of the triangle, or the bitwise complement for a back face, shape (n,).
-        x: Mean column of the samples in the image, shape (n,); ``y`` is the mean row.
-        inverse: Inverse depth of a sample, 1/m, shape (n,).
-        share: Barycentric weights of the triangle's corners, shape (3, n).
-        position: Camera frame, metres, shape (3, n).
-        normal: Unit normal towards the camera, camera frame, shape (3, n).
-        albedo: Linear RGB, shape (3, n).
-        bulge: Height of the smooth surface above the flat triangle, metres, shape (n,).
-        alpha: Width of the GGX lobe, shape (n,).
-    """
-
-    pixel: Array
-    weight: Array
-    face: Array
-    x: Array
+    pixel: Array  # Index of the pixel in the window, row by row, shape (n,)
+    weight: Array  # Number of the pixel's samples in the fragment, shape (n,)
+    face: Array  # Index of the triangle, or the bitwise complement for a back face, shape (n,)
+    x: Array  # Mean column of the samples in the image, shape (n,); ``y`` is the mean row
     y: Array
-    inverse: Array
-    share: Array
-    position: Array
-    normal: Array
-    albedo: Array
-    bulge: Array
-    alpha: Array
+    inverse: Array  # Inverse depth of a sample, 1/m, shape (n,)
+    share: Array  # Barycentric weights of the triangle's corners, shape (3, n)
+    position: Array  # Camera frame, metres, shape (3, n)
+    normal: Array  # Unit normal towards the camera, camera frame, shape (3, n)
+    albedo: Array  # Linear RGB, shape (3, n)
+    bulge: Array  # Height of the smooth surface above the flat triangle, metres, shape (n,)
+    alpha: Array  # Width of the GGX lobe, shape (n,)
 
 
 _GROUP_TYPES: Final = {
@@ -95,12 +82,7 @@ def gather_fragments(
 
 @compiled()
 def _group(
-    window: Box,
-    samples: Samples,
-    first_id: int,
-    patches: Array,
-    offsets: Array,
-    groups: tuple[Array, ...],
+    box: Box, samples: Samples, first_id: int, patches: Array, offsets: Array, groups: Groups
 ) -> int:
     """Group the samples of every pixel by smooth patch, and return the number of groups.
 
@@ -111,8 +93,8 @@ def _group(
     num_faces = patches.shape[0]
     centre = offsets.shape[0] - 1
     number = 0
-    for j in range(window[1], window[3]):
-        for i in range(window[0], window[2]):
+    for j in range(box[1], box[3]):
+        for i in range(box[0], box[2]):
             first = ids[j, i, 0]
             # Mostly one triangle, or nothing, fills a pixel.
             alike = first == ids[j, i, 1] and first == ids[j, i, 2] and first == ids[j, i, 3]

@@ -22,11 +22,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
-from dopepp.virtual.renderers.raster.visibility import (
-    Box,
-    Samples,
-    ShadowMap,
-)
+from dopepp.virtual.renderers.raster.visibility import Box, Samples, ShadowMap
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
@@ -39,21 +35,13 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 class _LitPlane(NamedTuple):
-    """A plane and its lights for compiled code, float32.
+    """A plane and its lights for compiled code, float32."""
 
-    Attributes:
-        to_point: Map from a pixel to its point on the plane and 1/z, shape (4, 3).
-        normal: Unit normal, camera frame.
-        sky: Linear RGB of the ambient light on the plane.
-        lights: Position and colour of every light, see :class:`ShadowMap`, shape (lights, 6).
-        P: Projection of every shadow map, see :class:`ShadowMap`, shape (lights, 3, 4).
-    """
-
-    to_point: Array
-    normal: Array
-    sky: Array
-    lights: Array
-    P: Array
+    to_point: Array  # Map from a pixel to its point on the plane and 1/z, shape (4, 3)
+    normal: Array  # Unit normal, camera frame
+    sky: Array  # Linear RGB of the ambient light on the plane
+    lights: Array  # Position and colour of every light, see :class:`ShadowMap`, shape (lights, 6)
+    P: Array  # Projection of every shadow map, see :class:`ShadowMap`, shape (lights, 3, 4)
 
 
 def darken_plane(
@@ -170,9 +158,7 @@ def hidden_sky(
 ) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
     """Return the share of the sky over a plane that objects hide; None if all are below the plane.
 
-    Args:
-        frame: Map from the camera frame to (x, y) on the plane and the height above it, metres.
-        objects: Objects that hide the sky.
+    ``frame`` maps the camera frame to (x, y) on the plane and the height above it, metres.
 
     Returns:
         Position (x, y) of the grid's first cell and a cell's side, metres; hidden share per cell.

@@ -120,14 +120,9 @@ def _blend_colours(face: Array, share: Array, faces: Array, colours: Array, albe
 
 @compiled(fastmath=True)
 def _tint_albedo(
-    noise: Array,
-    fragments: Fragments,
-    T_cam_obj: Array,
-    focal: float,
-    amplitude: float,
-    pitch: float,
+    noise: Array, fragments: Fragments, T_cam_obj: Array, focal: float, height: float, pitch: float
 ) -> None:
-    """Multiply the albedo by 1 + ``amplitude`` times noise with a lattice of ``pitch`` metres."""
+    """Multiply the albedo by 1 + ``height`` times noise with a lattice of ``pitch`` metres."""
     position, albedo = fragments.position, fragments.albedo
     least, greatest = NOISE_LIMITS
     for p in range(position.shape[1]):
@@ -138,7 +133,7 @@ def _tint_albedo(
         x = position[0, p] - T_cam_obj[0, 3]
         y = position[1, p] - T_cam_obj[1, 3]
         z = position[2, p] - T_cam_obj[2, 3]
-        tint = 1.0 + amplitude * min(fade, 1.0) * _value_noise(
+        tint = 1.0 + height * min(fade, 1.0) * _value_noise(
             noise,
             (T_cam_obj[0, 0] * x + T_cam_obj[1, 0] * y + T_cam_obj[2, 0] * z) / pitch,
             (T_cam_obj[0, 1] * x + T_cam_obj[1, 1] * y + T_cam_obj[2, 1] * z) / pitch,
@@ -231,13 +226,7 @@ def reflect_ambient(
     A dielectric scatters the hemisphere around its normal; its weak gloss is ignored. A metal
     mirrors the hemisphere's colour in the reflected direction, tinted with its albedo; a smoother
     metal mirrors more sharply.
-
-    Args:
-        fragments: Fragments of the object.
-        opened: Share of the ambient light that reaches each point.
-        ambient: Result of :func:`ambient_row`.
-        metallic: 1 for metals, otherwise 0.
-        radiance: Filled with linear RGB.
+    ``opened`` is the share of the light that reaches each point.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
@@ -269,13 +258,7 @@ def reflect_panels(
     """Add the light of distant panels: scattered by a dielectric, mirrored by a metal.
 
     A GGX lobe of width α spreads a mirror image by √2 α along both axes.
-
-    Args:
-        fragments: Fragments of the object.
-        opened: Share of the ambient light that reaches each point.
-        panels: Result of :func:`panel_rows`.
-        metallic: 1 for metals, otherwise 0.
-        radiance: Linear RGB, increased in place.
+    ``opened`` is the share of the ambient light that reaches each point.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
@@ -305,27 +288,18 @@ def reflect_panels(
 
 @compiled(fastmath=True)
 def reflect_light(
-    fragments: Fragments,
-    lit: Array,
-    light: Array,
-    specular: float,
-    metallic: float,
-    radiance: Array,
+    fragments: Fragments, lit: Array, light: Array, specular: float, metal: float, radiance: Array
 ) -> None:
     """Add the reflection of a point light: Lambert, and GGX with Smith's and Schlick's factors.
 
-    Args:
-        fragments: Fragments of the object.
-        lit: Share of the light that reaches each point.
-        light: Field ``light`` of the light's :class:`ShadowMap`.
-        specular: Reflectance of a dielectric at normal incidence.
-        metallic: 1 for a metal, whose reflectance is its albedo.
-        radiance: Linear RGB, increased in place.
+    ``lit`` is the share of the light that reaches each point, and ``light`` a field of
+    :class:`ShadowMap`. ``specular`` is a dielectric's reflectance at normal incidence; a metal's is
+    its albedo. ``radiance`` (linear RGB) is increased in place.
     """
     position, normal = fragments.position, fragments.normal
     albedo, alpha = fragments.albedo, fragments.alpha
-    base, metal = np.float32(specular), np.float32(metallic)
-    matt = _ONE - metal
+    base, metallic = np.float32(specular), np.float32(metal)
+    matt = _ONE - metallic
     for p in range(position.shape[1]):
         px, py, pz = position[0, p], position[1, p], position[2, p]
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
@@ -350,7 +324,7 @@ def reflect_light(
         # No branch: a point that is not lit adds nothing, and the loop stays a vector loop.
         strength = lit[p] * n_l / square
         for c in range(3):
-            upright = base + metal * (albedo[c, p] - base)
+            upright = base + metallic * (albedo[c, p] - base)
             fresnel = upright + (_ONE - upright) * grazing5
             diffuse = matt * albedo[c, p] * (_ONE - fresnel)
             radiance[c, p] += strength * light[3 + c] * (diffuse + fresnel * lobe)

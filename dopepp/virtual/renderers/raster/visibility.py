@@ -28,8 +28,7 @@ from dopepp.virtual.triangles import (
     scratch,
 )
 
-Box = tuple[int, int, int, int]
-"""(left, top, right, bottom) in pixels, right and bottom excluded."""
+Box = tuple[int, int, int, int]  # (left, top, right, bottom) in pixels, right and bottom excluded
 
 Extent = tuple[float, float, float, float]
 """Smallest and largest pixel coordinates (left, top, right, bottom)."""
@@ -41,17 +40,12 @@ _ZERO, _ONE = np.float32(0), np.float32(1)  # literals would turn the arithmetic
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The projected vertices of an object.
+    """The projected vertices of an object."""
 
-    Attributes:
-        cam: Vertices in the camera frame, metres, shape (V, 3).
-        hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
-        extent: Bounds of the projected vertices, pixels; infinite if the object crosses the depth
-            ``NEAR``, left > right if it is entirely nearer.
-    """
-
-    cam: Array
-    hom: Array
+    cam: Array  # Vertices in the camera frame, metres, shape (V, 3)
+    hom: Array  # Homogeneous pixels ``K x_cam``, shape (V, 3)
+    # Bounds of the projected vertices, pixels; infinite if the object crosses the depth ``NEAR``,
+    # left > right if it is entirely nearer.
     extent: Extent
 
     def box(self, size: Size) -> Box | None:
@@ -93,17 +87,11 @@ def box_around(boxes: Iterable[Box | None]) -> Box | None:
 
 
 class Samples(NamedTuple):
-    """The sample buffers of a window of the image.
+    """The sample buffers of a window of the image."""
 
-    Attributes:
-        origin: Image pixel (x, y) of the window's first pixel.
-        inverse_depth: 1/m per sample, 0 for empty samples, float32, shape (height, width, S).
-        ids: Triangle per sample, counted over all objects, −1 for none, int32, same shape.
-    """
-
-    origin: tuple[int, int]
-    inverse_depth: Array
-    ids: Array
+    origin: tuple[int, int]  # Image pixel (x, y) of the window's first pixel
+    inverse_depth: Array  # 1/m per sample, 0 for empty samples, float32, shape (height, width, S)
+    ids: Array  # Triangle per sample, counted over all objects, −1 for none, int32, same shape
 
 
 def draw_samples(
@@ -166,20 +154,14 @@ def backdrop(
 
 @dataclass(frozen=True, eq=False)
 class ShadowMap:
-    """A scene's depth from one light.
+    """A scene's depth from one light."""
 
-    Attributes:
-        light: Position (camera frame, metres) and linear RGB at one metre, shape (6,).
-        inverse_depth: 1/m, 0 for empty texels, shape (height, width, 1).
-        P: Projection from the camera frame to homogeneous pixels of the map, the third of which is
-            the depth from the light, shape (3, 4), float32.
-        texel: Metres that a texel spans per metre of depth.
-    """
-
-    light: Array
-    inverse_depth: Array
+    light: Array  # Position (camera frame, metres) and linear RGB at one metre, shape (6,)
+    inverse_depth: Array  # 1/m, 0 for empty texels, shape (height, width, 1)
+    # Projection from the camera frame to homogeneous pixels of the map, the third of which is the
+    # depth from the light, shape (3, 4), float32.
     P: Array
-    texel: float
+    texel: float  # Metres that a texel spans per metre of depth
 
     def lit_shares(self, position: Array, normal: Array, bulge: Array) -> Array:
         """Return the share of the light that reaches each point; 0 where it faces away.

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from dopepp.geometry.camera import make_transform, project
-from dopepp.virtual import make_surface, render, visible_fractions
+from dopepp.virtual import make_surface, render
+from dopepp.virtual.renderers.raster import visible_fractions
 from dopepp.virtual.scene import Ambient, Light, Plane, SceneObject
 from tests.parts.makers import mesh_of
 from tests.virtual.conftest import even_light, pixel_rays
