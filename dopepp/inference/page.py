@@ -41,9 +41,7 @@ HOST: Final = "127.0.0.1"  # reachable from this machine only
 MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels
 SHOWN_PX: Final = 1600  # longest side of the drawn image, pixels
 
-VIEW, NUMBERS, FILE = "field of view", "K", "camera file"
-"""Ways to specify the camera."""
-
+VIEW, NUMBERS, FILE = "field of view", "K", "camera file"  # ways to specify the camera
 COLUMNS: Final = ["part", "score", "x mm", "y mm", "z mm", "qw", "qx", "qy", "qz", "error px"]
 """Table: position and quaternion in the camera frame, and the reprojection error."""
 

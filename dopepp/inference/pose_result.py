@@ -70,7 +70,6 @@ AXES: Final[tuple[Colour, ...]] = ((240, 50, 50), (50, 200, 50), (70, 110, 255))
 
 AXIS: Final = 0.35  # length of a drawn axis, diameters
 LINE: Final = 1 / 640  # width of a line, share of the image width
-
 FINEST: Final = 1 / 60
 """Largest width of a line, share of the instance's extent: lines do not hide a small part."""
 

@@ -49,7 +49,6 @@ ELSEWHERE: Final = 0.1
 """Mean distance between keypoints above which track and detection disagree, diameters."""
 
 OUTVOTED: Final = 2  # consecutive disagreeing detections after which a track moves to them
-
 DOUBTFUL: Final = 0.8
 """Share of the usual agreement below which a track is doubtful. On rendered sequences, the share
 was 0.97 at correct poses, and 0.5 at poses that an occluder had displaced."""
@@ -61,7 +60,6 @@ pose's outline may coincide with other edges."""
 SURE: Final = 0.85  # agreement below which the network is run every OFTEN frames
 OFTEN: Final = 5
 USUAL: Final = 0.1  # weight of a frame in the usual agreement
-
 PATIENCE: Final = 6
 """Number of consecutive doubtful frames in which a part continues its motion before it is lost."""
 

@@ -38,7 +38,6 @@ GROUPS: Final = ("parts", "meshes", "uncertainty")
 CENTRE: Final = 0.5  # coordinate of the top-left pixel's centre in Rerun
 LOCALHOST: Final = "127.0.0.1"
 START_S: Final = 20.0  # timeout for opening a window, seconds
-
 ELLIPSOID: Final = 2.8
 """Half axes of the ellipsoid, standard deviations: 95 % of a normal distribution in space."""
 

@@ -35,7 +35,6 @@ from dopepp.parts.size import is_plausible, size_in_words
 __all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
 
 SAME: Final = 1.05  # ratio of two sizes of a part that simplification of its mesh may cause
-
 DARK: Final = 70.0
 """Grey level (0 to 255) of highlights below which an image is dark: above 105 in good renders, 35
 to 60 at 1/16 of the light."""

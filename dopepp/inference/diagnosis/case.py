@@ -21,15 +21,12 @@ from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import Detection
 
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
-
 BELIEVED: Final = (0.4, 6)
 """Smallest mean belief and number of keypoints of a detection outside the expected distances."""
 
 MIN_PX: Final = 24  # smallest side of an image whose sharpness can be measured
-
 NARROWEST: Final = 0.5  # pixels: narrower edges cannot be distinguished
 FEWEST: Final = 8  # smallest number of edge pixels for a measurement of sharpness
-
 STRONG: Final = 0.3
 """Share of the strongest gradient above which an edge is measured: weaker edges are shading, noise
 or out-of-focus background."""

@@ -37,7 +37,6 @@ MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 Covariances = Float[np.ndarray, "poses 6 6"]
 Residuals = Float[np.ndarray, "poses 6"]  # rotations (radians), translations (metres), camera axes
 Noise = Float[np.ndarray, "2"]  # standard deviations of a robot's pose: radians, metres
-
 MIN_POSES: Final = 3
 ROBOT_NOISE: Final = (0.0005, 0.0005)  # initial standard deviations, radians and metres
 OUTLIER: Final = 40.0  # squared Mahalanobis distance; one in two million correct poses exceeds it

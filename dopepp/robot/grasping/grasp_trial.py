@@ -63,13 +63,9 @@ EXACT: Final = "exact poses"
 FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
 
 DEFAULT_DISTANCE: Final = (0.18, 0.22)  # distances of the camera without a trained range, metres
-TILT: Final = np.radians(17.0)
-"""Largest rotation of the camera about its x and y axes from straight down, radians."""
-
+TILT: Final = np.radians(17.0)  # of the camera about its x and y axes from straight down
 DISTANCE_MARGIN: Final = 1.2  # factor on camera distances, for parts off the tray's centre
-FLAT_TILT_DEG: Final = 60.0
-"""Largest tilt of templates for flat parts: the camera's tilt plus the effect of perspective."""
-
+FLAT_TILT_DEG: Final = 60.0  # of templates for flat parts: TILT plus the effect of perspective
 SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 0.4}
 MAX_OBSTACLES: Final = 8  # number of parts in the planner's model
 EXTRA_ATTEMPTS: Final = 3  # number of attempts at a heap beyond its number of parts
@@ -82,8 +78,7 @@ class PoseSource:
 
     kind: str = "network"  # `network`, `templates`, `exact` (the simulation's) or `random`
     matrices: str = "calibrated"  # `calibrated` or `true` camera matrices for the network's poses
-    # Errors of exact poses in a random direction and about a random axis, millimetres and degrees.
-    error: tuple[float, float] = (0.0, 0.0)
+    error: tuple[float, float] = (0.0, 0.0)  # of exact poses in random directions, mm and degrees
 
     @property
     def name(self) -> str:
@@ -119,13 +114,12 @@ class Record:
     number: int  # index of the trial, from 0; equal indices have equal scenes
     source: str  # name of the pose source
     off: float  # error added to an exact pose, millimetres and degrees
-    seen: bool  # whether the pose source returned a pose
+    seen: bool  # whether the pose source returned a pose; if not, errors are NaN
     recognised: bool  # whether ADD was below a tenth of the part's diameter
-    # Errors are in the arm's base frame, include calibration errors, and are measured before the
-    # pose is aligned with the bench. Without a pose, errors are NaN.
-    add_mm: float  # ADD, millimetres
-    error_mm: float  # position error of the part's origin, millimetres
-    error_deg: float  # rotation error of the pose, degrees
+    # Errors include calibration errors, and are measured before the alignment with the bench.
+    add_mm: float  # ADD
+    error_mm: float  # of the part's origin
+    error_deg: float
     caught: bool  # whether the gripper held the part after lifting and shaking
     failure: str  # one of `FAILURES`, or empty
     hand_eye_mm: float  # position error by the hand-eye calibration at the parts' distance
@@ -160,9 +154,8 @@ class TrialScene:
     joints: Joints  # measured joint angles at the time of the image, radians
     T_base_cam: Transform  # the true pose of the camera
     image: RGBImage
-    photograph: Photographer  # renders images of the scene from other camera poses
-    # Returns the photograph function for other poses of the objects, with the same light.
-    arrange: Callable[[Sequence[Transform]], Photographer]
+    photograph: Photographer
+    arrange: Callable[[Sequence[Transform]], Photographer]  # for other poses in the same light
     taken: frozenset[int] = frozenset()  # indices of the objects that earlier attempts lifted
 
     @property
@@ -211,8 +204,7 @@ class Trials:
         from dopepp.inference.estimator import PoseEstimator
 
         assert self.task.network is not None
-        refine = "region" if self.task.refine else None
-        return PoseEstimator.load(self.task.network, refine=refine)
+        return PoseEstimator.load(self.task.network, refine="region" if self.task.refine else None)
 
     @cached_property
     def templates(self) -> PoseEstimator:
@@ -239,7 +231,7 @@ class Trials:
         return near + 0.4 * (far - near), near + 0.75 * (far - near)
 
     def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
-        """Sample the errors of the robot for a block of :data:`BLOCK` trials, and calibrate it."""
+        """Sample the errors of the robot for a block of trials, and calibrate it."""
         rng = np.random.default_rng([self.task.seed, block, 1])
         robot = draw_robot(rng, self.tip)
         return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
@@ -281,7 +273,7 @@ class Trials:
         """Yield the attempts of a trial: one, or for a heap as many as it takes to empty the heap.
 
         A heap gets at most :data:`EXTRA_ATTEMPTS` more attempts than it has parts, and is given up
-        when two successive attempts find no plan. Before each attempt the camera takes a new image.
+        when two successive attempts find no plan.
         """
         limit = len(scene.parts) + EXTRA_ATTEMPTS if self.task.layout == "heap" else 1
         failed: list[Transform] = []
@@ -310,16 +302,10 @@ class Trials:
         joints, T_base_cam = self._aim_camera(scene.robot, rng)
         poses = self._settle(scene.cell, state, scene.robot, joints)
         photograph = scene.arrange(poses)
+        image, taken = photograph(T_base_cam, rng), scene.taken.union(lifted)
+        scene = replace(scene, attempt=scene.attempt + 1, start=state, poses=poses, taken=taken)
         return replace(
-            scene,
-            attempt=scene.attempt + 1,
-            start=state,
-            poses=poses,
-            joints=joints,
-            T_base_cam=T_base_cam,
-            image=photograph(T_base_cam, rng),
-            photograph=photograph,
-            taken=scene.taken.union(lifted),
+            scene, joints=joints, T_base_cam=T_base_cam, image=image, photograph=photograph
         )
 
     def attempt(
@@ -333,17 +319,17 @@ class Trials:
         if not observation.parts:
             return Attempt(scene, self._record(scene, source, observation, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        parts = observation.parts[:MAX_OBSTACLES]
+        parts, joints = observation.parts[:MAX_OBSTACLES], observation.joints
         low = LOW[self.task.layout]
         poses = (align_with_bench(part.T_base_obj, hull, bench, low) for part in parts)
         flat = [replace(part, T_base_obj=pose) for part, pose in zip(parts, poses, strict=True)]
-        planner, joints = self._planner(scene), observation.joints
+        planner = self._planner(scene)
         choice = choose_part(planner, flat, self.part.points, self.grasps, joints, failed)
+        estimate = parts[choice.number if choice else 0].T_base_obj
         if choice is None:
-            estimate = parts[0].T_base_obj
             record = self._record(scene, source, observation, estimate, None)
             return Attempt(scene, record, estimate=estimate)
-        estimate, state = parts[choice.number].T_base_obj, copy(scene.start)
+        state = copy(scene.start)
         execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
         if observation.second_view:
             execution.move(np.stack([scene.joints, joints]))
@@ -368,14 +354,10 @@ class Trials:
         estimator = self.templates if source.kind == "templates" else self.estimator
         lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
         if self.task.views == 1:
-            detections = estimator.predict(scene.image, lens.K, lens.coefficients)
-            parts = [
-                EstimatedPart(
-                    T_base_cam @ item.T_cam_obj,
-                    item.score if item.probability is None else item.probability,
-                )
-                for item in self._likely(detections)
-            ]
+            likely_parts = self._likely(estimator.predict(scene.image, lens.K, lens.coefficients))
+            chances = [p.score if p.probability is None else p.probability for p in likely_parts]
+            seen = [T_base_cam @ part.T_cam_obj for part in likely_parts]
+            parts = [EstimatedPart(*pair) for pair in zip(seen, chances, strict=True)]
             return SceneObservation(_by_height(parts), scene.joints)
         result = estimator.predict_views([scene.image], [lens], [T_base_cam])
         likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
@@ -422,8 +404,8 @@ class Trials:
         counts: dict[str, Any] = {"attempt": scene.attempt, "parts": len(scene.parts)}
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
-            nan = float("nan")
-            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends, **counts)
+            nans = [float("nan")] * 3
+            return Record(*trial, False, False, *nans, False, "not seen", *ends, **counts)
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))

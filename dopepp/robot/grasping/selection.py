@@ -42,11 +42,8 @@ class Choice:
 def pick_score(probability: float, graspability: float, covered: float, failures: int) -> float:
     """Return the preference for a part, from 0 to 1.
 
-    Args:
-        probability: Probability that the pose is correct.
-        graspability: Quality of the best feasible grasp, from 0 to 1.
-        covered: Share of the part's surface that lies below other parts.
-        failures: Number of failed attempts to grasp this part.
+    It depends on the probability of its pose, the quality of its best grasp, the covered share of
+    its surface, and the number of failed attempts to grasp it.
     """
     return probability * graspability * (1 - covered) * TRIED**failures
 
@@ -54,10 +51,7 @@ def pick_score(probability: float, graspability: float, covered: float, failures
 def covered_share(target: Transform, others: Sequence[Transform], points: Points) -> float:
     """Return the share of a part's surface points that lie below points of other parts.
 
-    Args:
-        target: Pose T_base_obj of the part; z of the base points upwards.
-        others: Poses of the other parts.
-        points: Points of the part's surface, object frame, metres.
+    ``target`` and ``others`` are poses T_base_obj of equal parts; z of the base points upwards.
     """
     if not others:
         return 0.0
@@ -80,34 +74,23 @@ def choose_part(
 ) -> Choice | None:
     """Return the part with the largest :func:`pick_score`, or None if no part can be grasped.
 
-    Args:
-        planner: Planner of the arm's motions.
-        parts: All detected parts.
-        points: Points of the part's surface, object frame, metres.
-        grasps: The part's grasps, the best first.
-        start: Current joint angles of the arm.
-        failed: Poses T_base_obj of parts that were not grasped in earlier attempts.
+    ``points`` are the surface of each part, and ``grasps`` its grasps, the best first. ``failed``
+    are poses T_base_obj of parts that were not grasped in earlier attempts.
     """
     poses = [part.T_base_obj for part in parts]
+    orders = [[poses[k], *poses[:k], *poses[k + 1 :]] for k in range(len(parts))]  # first to grasp
     factors = []
-    for number, part in enumerate(parts):
-        others = [*poses[:number], *poses[number + 1 :]]
-        covered = covered_share(poses[number], others, points)
-        shifts = (np.linalg.norm(pose[:3, 3] - poses[number][:3, 3]) for pose in failed)
+    for part, (pose, *others) in zip(parts, orders, strict=True):
+        shifts = (np.linalg.norm(other[:3, 3] - pose[:3, 3]) for other in failed)
         failures = sum(bool(shift < SAME) for shift in shifts)
-        factors.append((part.probability, covered, failures))
+        factors.append((part.probability, covered_share(pose, others, points), failures))
     limits = [pick_score(chance, 1.0, covered, tried) for chance, covered, tried in factors]
     best: Choice | None = None
     best_score = 0.0
     for number in sorted(range(len(parts)), key=lambda number: -limits[number]):
         if limits[number] <= best_score:
             break  # not even a perfect grasp makes this part the best
-        others = [*poses[:number], *poses[number + 1 :]]
-        plan = planner.plan([poses[number], *others], grasps, start)
-        if plan is None:
-            continue
-        probability, covered, failures = factors[number]
-        score = pick_score(probability, plan.quality, covered, failures)
-        if score > best_score:
-            best, best_score = Choice(number, plan), score
+        plan = planner.plan(orders[number], grasps, start)
+        if plan is not None and limits[number] * plan.quality > best_score:
+            best, best_score = Choice(number, plan), limits[number] * plan.quality
     return best

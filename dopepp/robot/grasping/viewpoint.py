@@ -42,16 +42,9 @@ def choose_viewpoint(
 ) -> Viewpoint | None:
     """Return the view that is expected to reduce the pose error of the first part most.
 
-    Args:
-        planner: Planner that checks motions of the hand for collisions.
-        K: Calibrated camera matrix, pixels.
-        start: Joint angles at the first image.
-        parts: Parts detected in the first image, robot base frame; the first is to be grasped.
-            Without a part, the first candidate in reach is returned.
-        mesh: Mesh of the part.
-
-    Returns:
-        The view, or None if the arm reaches no view that shows the whole part.
+    ``start`` are the joint angles at the first image, and ``parts`` its detections in the robot's
+    base frame. Without a part, the first candidate in reach is returned. None means that the arm
+    reaches no view that shows the whole part.
     """
     T_base_cam = _camera_pose(planner, start)
     middle = mesh.vertices.mean(axis=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections.abc import Sequence
-from typing import Final, Generic, NamedTuple, TypeVar
+from typing import Final, Generic, TypeVar
 
 MAX_LAG_S: Final = 1 / 60  # default of the largest lag, seconds: half a frame period at 30 Hz
 WAITING: Final = 10  # images of a camera that wait for those of the others
@@ -13,23 +13,12 @@ RESTART_S: Final = 1.0  # decrease of a camera's stamps, seconds, after which pa
 Item = TypeVar("Item")
 
 
-class _Waiting(NamedTuple, Generic[Item]):
-    """An image that waits for the images of the other cameras."""
-
-    stamp: float
-    item: Item
-
-
 class StampPairing(Generic[Item]):
-    """Pairs images of several cameras into sets with nearly equal stamps.
+    """Pairs images of several cameras into sets with nearly equal stamps, seconds.
 
     A set is complete as soon as the stamps of one image of each camera differ by at most
     ``max_lag_s``. If ``max_lag_s`` is at most half of every camera's frame period, these images are
     nearest to each other. Each image is in one set at most, and the stamps of sets increase.
-
-    Args:
-        num_cameras: Number of cameras.
-        max_lag_s: Largest difference of the stamps in a set, seconds.
     """
 
     def __init__(self, num_cameras: int, max_lag_s: float = MAX_LAG_S) -> None:
@@ -37,7 +26,7 @@ class StampPairing(Generic[Item]):
         self.lag_s: float | None = None
         """Difference of the stamps in the last set, or of the last images that were not paired."""
         self.num_sets = 0
-        self._waiting: list[list[_Waiting[Item]]] = [[] for _ in range(num_cameras)]
+        self._waiting: list[list[tuple[float, Item]]] = [[] for _ in range(num_cameras)]
         self._unpaired = [0] * num_cameras
         self._last = -float("inf")  # latest stamp in the last set
         self._dropped_before = 0  # sets that were dropped before the last set
@@ -57,32 +46,23 @@ class StampPairing(Generic[Item]):
         return min(self._unpaired)
 
     def add(self, camera: int, stamp: float, item: Item) -> Sequence[Item] | None:
-        """Add an image, and return the set that it completes, if any.
-
-        Args:
-            camera: Index of the camera.
-            stamp: Time of the image, seconds.
-            item: The image.
-
-        Returns:
-            One item of each camera, or None.
-        """
+        """Add an image of camera number ``camera``; return the set that it completes, if any."""
         waiting = self._waiting[camera]
-        newest = waiting[-1].stamp if waiting else self._last
+        newest = waiting[-1][0] if waiting else self._last
         if stamp < newest - RESTART_S:  # a restarted recording or simulation
             self._waiting = [[] for _ in self._waiting]
             self._last = -float("inf")
         elif stamp <= self._last:
             self._unpaired[camera] += 1
             return None
-        insort(self._waiting[camera], _Waiting(stamp, item), key=lambda image: image.stamp)
+        insort(self._waiting[camera], (stamp, item), key=lambda image: image[0])
         del self._waiting[camera][:-WAITING]  # the other cameras are silent or slower
         return self._complete_set()
 
     def _complete_set(self) -> list[Item] | None:
         """Return the first set within the largest lag; drop the images before it."""
         while all(self._waiting):
-            heads = [waiting[0].stamp for waiting in self._waiting]
+            heads = [waiting[0][0] for waiting in self._waiting]
             self.lag_s = max(heads) - min(heads)
             if self.lag_s > self.max_lag_s:
                 oldest = heads.index(min(heads))
@@ -90,9 +70,9 @@ class StampPairing(Generic[Item]):
                 self._unpaired[oldest] += 1
                 continue
             self.num_sets, self._last = self.num_sets + 1, max(heads)
-            complete = [waiting[0].item for waiting in self._waiting]
+            complete = [waiting[0][1] for waiting in self._waiting]
             for number, waiting in enumerate(self._waiting):
-                later = [image for image in waiting[1:] if image.stamp > self._last]
+                later = [image for image in waiting[1:] if image[0] > self._last]
                 self._unpaired[number] += len(waiting) - 1 - len(later)
                 self._waiting[number] = later
             self._dropped_before = self.dropped

@@ -2,31 +2,27 @@
 
 The images of several cameras are paired by their stamps (:mod:`.pairing`) into sets.
 The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
-The queue is short. A camera is faster than a network, so the latest image waits in a
-:class:`Slot` while its predecessor is processed. Topics whose message types are not installed
-(``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
+The worker runs in a thread, which the latest image reaches through a :class:`.slot.Slot`. Topics
+whose message types are not installed (``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
 """
 
 from __future__ import annotations
 
 import array
 import logging
-import threading
-import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform
-from dopepp.geometry.transform_file import parse_transform
+from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.rotation import quaternion_to_matrix
 from dopepp.inference.frames.ros import info_topic
 from dopepp.robot.nodes.messages import (
     DIAGNOSTICS,
@@ -38,21 +34,18 @@ from dopepp.robot.nodes.messages import (
     diagnosis,
 )
 from dopepp.robot.nodes.pairing import MAX_LAG_S, StampPairing
+from dopepp.robot.nodes.slot import Pace, Slot
 from dopepp.robot.nodes.views_worker import ViewsWorker
 from dopepp.robot.nodes.worker import Shot, Stamp, Worker, stamp_of
 
 QUEUE_IN: Final = 5  # a shorter queue loses images on a busy machine; a longer one delays them
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
-PATIENCE_S: Final = 5.0  # seconds to wait for the last image when the node stops
 SILENT_S: Final = 5  # seconds without an image before a warning
 UNPAIRED: Final = 10  # consecutive dropped sets before a warning
 CHECKPOINTS: Final = -1.0  # parameter ``confidence`` that selects the checkpoint's threshold
-RECENT: Final = 100  # number of images over which rates and latencies are reported
 
 logger = logging.getLogger(__name__)
-
-Item = TypeVar("Item")
 
 
 def run(
@@ -64,12 +57,9 @@ def run(
 ) -> None:
     """Publish the poses in the images of ROS 2 topics until the process is interrupted.
 
-    Args:
-        worker: Estimator of the poses; a :class:`ViewsWorker` for several topics.
-        topics: Topic of each camera's images.
-        name: Name of the node, which prefixes its topics.
-        params: YAML file of ROS 2 parameters.
-        max_lag_s: Largest difference of the stamps in a set of images, seconds.
+    Several topics, one of each camera, need a :class:`ViewsWorker`, and the stamps of a set of
+    images differ by at most ``max_lag_s`` seconds. ``name`` prefixes the topics of the node, and
+    ``params`` is a YAML file of ROS 2 parameters.
 
     Raises:
         UserError: A name, the file or a parameter in it is invalid.
@@ -122,11 +112,7 @@ class _Node:
     """ROS 2 node that subscribes to images and publishes the worker's poses in them."""
 
     def __init__(
-        self,
-        worker: Worker,
-        topics: Sequence[str],
-        name: str,
-        max_lag_s: float = MAX_LAG_S,
+        self, worker: Worker, topics: Sequence[str], name: str, max_lag_s: float = MAX_LAG_S
     ) -> None:
         import rclpy
 
@@ -290,8 +276,7 @@ class _Node:
         stamp = Stamp(int(now), int(1e9 * (now % 1)))
         silences = [camera.problem for camera in self._cameras]
         problems = [self._worker.problem, *silences, self._pairing_problem()]
-        problem = next((text for text in problems if text), "")
-        return diagnosis(stamp, self._name, problem, values)
+        return diagnosis(stamp, self._name, next(filter(None, problems), ""), values)
 
     def _is_best_effort(self, topic: str) -> bool:
         """Return whether a publisher of an image topic offers best-effort delivery only."""
@@ -332,9 +317,7 @@ def _ros_errors(source: str) -> Iterator[None]:
 def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]:
     """Return a function that looks up the pose of a frame in the world in TF at a time.
 
-    Args:
-        node: Node of rclpy, which receives the transforms.
-        world: Name of the world frame.
+    ``node`` is a node of rclpy, which receives the transforms.
 
     Raises:
         UserError: ``tf2_ros`` is not installed. The function raises it if TF has no transform.
@@ -359,92 +342,11 @@ def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]
             problem = f"no transform from {world} to {frame} ({error!s:.200})"
             fix = "publish it, choose another --world, or pass --views rig.yaml"
             raise UserError(problem, "the pose of each camera in TF", fix) from error
-        shift, rotation = answer.transform.translation, answer.transform.rotation
-        fields = {
-            "translation": {axis: getattr(shift, axis) for axis in "xyz"},
-            "rotation": {axis: getattr(rotation, axis) for axis in "xyzw"},
-        }
-        return parse_transform(fields, f"TF from {world} to {frame}")
+        shift, turn = answer.transform.translation, answer.transform.rotation
+        R = quaternion_to_matrix(np.array([turn.w, turn.x, turn.y, turn.z]))
+        return make_transform(R, np.array([shift.x, shift.y, shift.z]))
 
     return look_up
-
-
-class Slot(Generic[Item]):
-    """Queue of length 1 to a worker thread: a new image replaces an image that still waits.
-
-    Args:
-        handle: Function that the thread calls with each image. An exception of this function ends
-            the thread and is raised again by :meth:`put` and :meth:`check`.
-    """
-
-    def __init__(self, handle: Callable[[Item], None]) -> None:
-        self._handle = handle
-        self._item: Item | None = None
-        self._fresh, self._stopped = threading.Condition(), False
-        self._error: Exception | None = None
-        self.received = self.replaced = 0
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def put(self, item: Item) -> None:
-        """Store an image for the thread in place of a waiting image."""
-        self.check()
-        with self._fresh:
-            self.received += 1
-            self.replaced += self._item is not None
-            self._item = item
-            self._fresh.notify()
-
-    def check(self) -> None:
-        """Raise the exception that ended the thread, if any."""
-        if self._error is not None:
-            raise self._error
-
-    def stop(self) -> None:
-        """Stop the thread after its current image, for which this method waits at most 5 s."""
-        with self._fresh:
-            self._stopped = True
-            self._fresh.notify()
-        self._thread.join(PATIENCE_S)
-
-    def _run(self) -> None:
-        """Process images until :meth:`stop` is called; the thread's main function."""
-        try:
-            while True:
-                with self._fresh:
-                    self._fresh.wait_for(lambda: self._item is not None or self._stopped)
-                    item, self._item = self._item, None
-                    if item is None or self._stopped:
-                        return
-                self._handle(item)
-        except Exception as error:
-            self._error = error
-
-
-class Pace:
-    """Rate and latency of the published answers, over the last :data:`RECENT` images."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._times, self._latencies = deque[float](maxlen=RECENT), deque[float](maxlen=RECENT)
-        self._answered = 0
-
-    def count(self, latency_s: float) -> None:
-        """Record an answer; ``latency_s`` is the time since its image was captured, seconds."""
-        self._times.append(self._clock())
-        self._latencies.append(1000 * latency_s)
-        self._answered += 1
-
-    def values(self) -> dict[str, str]:
-        """Return the number of answers, their rate and their latency as texts by name and unit."""
-        values = {"answered": str(self._answered)}
-        if len(self._times) > 1:
-            span = self._times[-1] - self._times[0]
-            values["rate (1/s)"] = f"{(len(self._times) - 1) / max(span, 1e-9):.1f}"
-        if self._latencies:
-            values["latency, median (ms)"] = f"{np.median(self._latencies):.1f}"
-            values["latency, 95 % (ms)"] = f"{np.percentile(self._latencies, 95):.1f}"
-        return values
 
 
 def native(kind: str, fields: Fields) -> Any:

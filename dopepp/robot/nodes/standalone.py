@@ -38,10 +38,7 @@ def send_lines(
 ) -> None:
     """Send the poses in each image as a line of JSON, like ``dopepp predict --json``.
 
-    Args:
-        worker: Estimator of the poses.
-        sources: Sources of images, e.g. videos, with their cameras.
-        address: ``host:port`` of a UDP receiver (default: stdout).
+    ``address`` is ``host:port`` of a UDP receiver (default: stdout).
 
     Raises:
         UserError: The address is invalid, or a source cannot be read.
@@ -86,11 +83,7 @@ def _print(line: str) -> None:
 
 
 def _parse_address(text: str) -> tuple[str, int]:
-    """Return the IP address and port of ``host:port``.
-
-    Raises:
-        UserError: The text has another form, or the host is unknown.
-    """
+    """Return the IP address and port of ``host:port``, or raise a ``UserError``."""
     host, _, port = text.rpartition(":")
     try:
         if not host or not 0 < int(port) < 65_536:
@@ -106,14 +99,9 @@ def _parse_address(text: str) -> tuple[str, int]:
 def process_bag(
     worker: Worker, source: Path, target: Path, topic: str | None, name: str
 ) -> Iterator[Answer | None]:
-    """Estimate the poses in a recording's images and write them to a new recording.
+    """Estimate the poses in a recording's images and write them to a new ``.mcap`` recording.
 
-    Args:
-        worker: Estimator of the poses.
-        source: Recording of ROS 1 or 2.
-        target: Recording to write, an ``.mcap`` file.
-        topic: Topic of the images; None if the recording has a single image topic.
-        name: Name of the node, which prefixes the topics of the new recording.
+    ``topic`` is None if the recording has a single image topic; ``name`` prefixes the new topics.
 
     Yields:
         The poses in each image, or None if the image cannot be processed.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -25,7 +25,6 @@ from dopepp.inference.tracker import PoseTracker
 from dopepp.recovery.detection import Detection
 
 PATIENCE: Final = 5  # number of consecutive images without ``camera_info`` before the warning
-
 OPTICAL: Final = "optical"  # part of the name of each frame whose z axis is forward (REP 103)
 
 logger = logging.getLogger(__name__)
@@ -114,7 +113,6 @@ class Worker:
         camera: Camera of all images, in place of their ``camera_info``.
         frame_id: Name of the camera's optical frame, in place of the frame in the messages.
         track: Track the parts from frame to frame; this includes refinement.
-        warn: Function that is called with the text of each warning.
 
     Raises:
         UserError: The estimator does not support the settings.
@@ -127,10 +125,9 @@ class Worker:
         camera: Camera | None = None,
         frame_id: str | None = None,
         track: bool = False,
-        warn: Callable[[str], None] = logger.warning,
     ) -> None:
         self._estimators = {estimator.refiner is not None: estimator}
-        self._camera, self._frame_id, self._send_warning = camera, frame_id, warn
+        self._camera, self._frame_id = camera, frame_id
         self._tracker = PoseTracker(self._estimator(True)) if track else None
         self._warned: set[str] = set()
         self._last: Stamp | None = None
@@ -163,14 +160,7 @@ class Worker:
         return self._estimators[refine]
 
     def process(self, *shots: Shot) -> Answer | None:
-        """Estimate the poses in the image of a ROS message.
-
-        Args:
-            shots: The only image.
-
-        Returns:
-            The poses, or None (after a warning) if the image cannot be processed.
-        """
+        """Estimate the poses in the only image; return None (after a warning) if it is invalid."""
         (shot,) = shots
         decoded = self._decoded(shot, self._camera)
         if decoded is None:
@@ -190,10 +180,7 @@ class Worker:
         return Answer(stamp, frame_id, result)
 
     def _decoded(self, shot: Shot, given: Camera | None) -> Decoded | None:
-        """Return an image with its camera, or None after a warning.
-
-        ``given`` is a camera that replaces the camera of ``camera_info``.
-        """
+        """Return an image with its camera (``given``, or ``camera_info``'s), or None and warn."""
         message, info, topic = shot
         try:
             image = decode_image(message)
@@ -227,12 +214,10 @@ class Worker:
         return Decoded(frame, camera, is_cropped, stamp, frame_id)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
-        """Estimate the poses in an image with the current settings.
+        """Estimate the poses in an image with the current settings, after undistorting it.
 
-        Args:
-            frame: The image.
-            camera: Camera that took the image; its lens distortion is removed first.
-            cropped: Whether the image is a crop, with its principal point far from the centre.
+        ``cropped`` states whether the image is a crop, with its principal point far from the
+        centre.
 
         Raises:
             UserError: The camera was calibrated for another image size.
@@ -250,18 +235,11 @@ class Worker:
             tracks, weaker = self._tracker.track(image, camera.K, cropped), self._tracker.weaker
             detections = [track.detection for track in tracks]
             ids = [track.identity for track in tracks]
+        speed = elapsed_by_step(before, estimator.spent_ms)
+        source = frame.name, frame.number, frame.time
+        threshold = estimator.min_score
         return PoseResult(
-            image,
-            camera.K,
-            detections,
-            elapsed_by_step(before, estimator.spent_ms),
-            frame.name,
-            frame.number,
-            frame.time,
-            ids,
-            self._shapes,
-            weaker,
-            estimator.min_score,
+            image, camera.K, detections, speed, *source, ids, self._shapes, weaker, threshold
         )
 
     def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:
@@ -287,11 +265,10 @@ class Worker:
             problem = f"images on {topic} without a stamp, which TF needs: "
             self._warn("no stamp", f"{problem}let the driver set header.stamp")
         elif last is not None and stamp < last:
-            decrease_s = last.seconds - stamp.seconds
             self._warn(
                 "back",
-                f"stamps on {topic} went back by {decrease_s:.3f} s: a restarted recording or "
-                "simulation, or two cameras on one topic? Parts are detected again",
+                f"stamps on {topic} went back by {last.seconds - stamp.seconds:.3f} s: a restarted "
+                "recording or simulation, or two cameras on one topic? Parts are detected again",
             )
             self._restart()
 
@@ -306,18 +283,14 @@ class Worker:
         self._warn(kind, problem)
 
     def _warn(self, kind: str, text: str) -> None:
-        """Send a warning unless a warning of this kind was sent before."""
+        """Log a warning unless a warning of this kind was logged before."""
         if kind not in self._warned:
             self._warned.add(kind)
-            self._send_warning(text)
+            logger.warning(text)
 
 
 def check_size(camera: Camera, image: RGBImage) -> None:
-    """Check that a camera was calibrated for the size of an image.
-
-    Raises:
-        UserError: It was calibrated for another size.
-    """
+    """Raise a ``UserError`` if a camera was calibrated for another size than an image's."""
     size = (image.shape[1], image.shape[0])
     if camera.size is not None and camera.size != size:
         sizes = f"{camera.size[0]}×{camera.size[1]}, and images of {size[0]}×{size[1]}"
