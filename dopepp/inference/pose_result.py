@@ -48,13 +48,11 @@ from dopepp.recovery.detection import Detection
 if TYPE_CHECKING:
     import pandas as pd
 
+# Undistorting and resizing, network, poses from maps or templates, refinement.
 STEPS: Final = ("pre", "network", "decode", "refine")
-"""Steps of a prediction: undistorting and resizing, network, poses from maps or templates,
-refinement."""
+FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"  # frame of T_cam_obj
 
-FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"
-"""Frame of all poses: ``T_cam_obj`` maps from the mesh's frame to this frame."""
-
+# Colours of the instances on an image, in turn.
 COLOURS: Final[tuple[Colour, ...]] = (
     YELLOW,
     (255, 120, 200),
@@ -63,8 +61,6 @@ COLOURS: Final[tuple[Colour, ...]] = (
     (170, 140, 255),
     (170, 230, 80),
 )
-"""Colours of the instances on an image, in turn."""
-
 AXES: Final[tuple[Colour, ...]] = ((240, 50, 50), (50, 200, 50), (70, 110, 255))
 """Colours of the object's x, y and z axis."""
 
@@ -141,11 +137,7 @@ class PoseResult:
         return canvas
 
     def save(self, path: Path | str) -> None:
-        """Write :meth:`plot` as PNG or JPEG, according to the suffix.
-
-        Raises:
-            UserError: The suffix is neither PNG's nor JPEG's, or the file cannot be written.
-        """
+        """Write :meth:`plot` as PNG or JPEG, according to the suffix, or raise a ``UserError``."""
         check_target(Path(path), IMAGES)
         write_image(Path(path), self.plot())
 

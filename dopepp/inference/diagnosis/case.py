@@ -40,12 +40,11 @@ class Case:
     Args:
         estimator: Estimator to diagnose.
         image: RGB, without distortion.
-        K: Camera matrix, pixels.
+        K: Camera matrix.
         parts: The estimator's parts, with meshes where available.
         distances: Nearest and farthest depth, metres (default: the training range).
         cropped: As in :meth:`PoseEstimator.predict`.
-        centres: Pixel of each shown part's centre; empty if the image shows none of the parts, None
-            if unknown.
+        centres: Pixel of each shown part's centre; None if it is unknown which parts are shown.
     """
 
     def __init__(

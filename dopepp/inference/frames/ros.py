@@ -30,9 +30,9 @@ RAW: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA: Final = "sensor_msgs/msg/CameraInfo"
 
-BAGS: Final = (".bag", ".mcap", ".db3")
-"""Suffixes of recordings; ROS 2 also records into folders with a ``metadata.yaml``."""
+BAGS: Final = (".bag", ".mcap", ".db3")  # ROS 2 also records into folders with a `metadata.yaml`
 
+# Bytes per pixel, and OpenCV's conversion to RGB.
 ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -48,7 +48,6 @@ ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
-"""Bytes per pixel, and OpenCV's conversion to RGB."""
 
 
 def decode_image(message: Any) -> RGBImage:
@@ -88,11 +87,11 @@ def info_topic(topic: str) -> str:
 class CameraInfo:
     """Content of a ``camera_info`` message."""
 
-    size: tuple[int, int]  # (width, height) of the sensor's image, which K and P belong to, pixels
+    size: tuple[int, int]  # (width, height) of the sensor's image, which K and P belong to
     model: str  # distortion model
     D: Sequence[float]  # distortion coefficients
-    K: Sequence[float]  # camera matrix, 9 numbers row by row
-    P: Sequence[float]  # projection matrix of undistorted images, 12 numbers row by row
+    K: Sequence[float]  # camera matrix, row by row
+    P: Sequence[float]  # 3×4 projection matrix of undistorted images, row by row
     binning: tuple[int, int] = (1, 1)  # sensor pixels per image pixel, across and down
     roi: Crop | None = None  # region of the sensor that is read out; None is the whole sensor
     frame_id: str = ""  # camera frame
@@ -116,11 +115,7 @@ class CameraInfo:
         )
 
     def camera(self, source: str, rectified: bool) -> Camera:
-        """Return the pinhole camera of the images.
-
-        Args:
-            source: Origin of the message, for error messages.
-            rectified: Whether the images are undistorted, so that P applies instead of K.
+        """Return the pinhole camera of the images; of undistorted images, P applies instead of K.
 
         Raises:
             UserError: The camera is not calibrated, or is not a pinhole camera.
@@ -147,11 +142,7 @@ class CameraInfo:
 
 
 class Bag(FrameSource):
-    """Images of one topic of a ROS recording.
-
-    Args:
-        path: File or folder of the recording.
-        topic: Image topic; required if several topics have images.
+    """Images of one topic of a ROS recording; the topic is required if several have images.
 
     Raises:
         UserError: The extra ``bags`` is not installed, the recording is unreadable or has no
@@ -170,11 +161,7 @@ class Bag(FrameSource):
         self.rate = max(1.0, (self.count - 1) / seconds) if seconds > 0 else 1.0
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th image.
-
-        Raises:
-            UserError: An image is damaged.
-        """
+        """Yield every ``stride``-th image; raise a ``UserError`` if an image is damaged."""
         for number, (seconds, message) in enumerate(self._messages([self.topic], RAW, COMPRESSED)):
             if number % stride:
                 continue
@@ -194,10 +181,9 @@ class Bag(FrameSource):
         return None
 
     def messages(self) -> Iterator[tuple[float, Any, Any | None]]:
-        """Yield time (seconds since 1970), image message and latest ``camera_info`` of each image.
+        """Yield time (seconds since 1970), message and latest ``camera_info``, if any, of an image.
 
-        Images before the first ``camera_info`` message are paired with that message. The third
-        value is None if the recording has no ``camera_info``.
+        Images before the first ``camera_info`` message are paired with that message.
         """
         topic = info_topic(self.topic)
         info = next((message for _, message in self._messages([topic], CAMERA)), None)
@@ -215,11 +201,8 @@ class Bag(FrameSource):
         store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
         decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         with self._opened() as reader:
-            links = [
-                link
-                for link in reader.connections
-                if link.topic in topics and link.msgtype in kinds
-            ]
+            every = reader.connections
+            links = [link for link in every if link.topic in topics and link.msgtype in kinds]
             # Without a selected connection, the reader would yield the messages of every topic.
             for link, recorded_ns, content in reader.messages(links) if links else ():
                 message: Any = decode(content, link.msgtype)
@@ -241,11 +224,7 @@ class Bag(FrameSource):
             raise self._unreadable(f"{error}") from error
 
     def _select(self, links: Sequence[Connection], topic: str | None) -> str:
-        """Return the requested image topic, or the only image topic.
-
-        Raises:
-            UserError: The recording lacks the requested topic, or has no or several image topics.
-        """
+        """Return the requested image topic, or the only image topic, or raise a ``UserError``."""
         names = sorted({link.topic for link in links})
         if topic in names or (topic is None and len(names) == 1):
             return topic or names[0]

@@ -118,6 +118,8 @@ def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
     """Calibrate the camera with OpenCV from all views, without rejection of outliers."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
+    num_threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # threads add up in random order, and the result would differ every time
     try:
         error_px, K, lens, rotations, _, deviations, _, errors_px = cv2.calibrateCameraExtended(
             points, pixels, size, None, None
@@ -126,6 +128,8 @@ def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
         problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
         allowed = "views tilted by 20 to 40° in several directions"
         raise UserError(problem, allowed, "take more images of the tilted board") from reason
+    finally:
+        cv2.setNumThreads(num_threads)
     normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
     x, y = np.concatenate([view.pixels for view in views]).T

@@ -39,6 +39,14 @@ def test_the_errors_of_the_lens_fit_its_deviations(views):
     assert (result.findings, result.outliers) == ((), ())
 
 
+def test_equal_views_have_equal_calibrations(views):
+    camera, detections = views
+    results = [calibrate_lens(detections, camera.size) for _ in range(4)]
+    for result in results[1:]:
+        np.testing.assert_array_equal(result.camera.K, results[0].camera.K)
+        assert result.camera.distortion == results[0].camera.distortion
+
+
 def test_the_file_is_read_by_every_camera_option(views, tmp_path):
     camera, detections = views
     result = calibrate_lens(detections, camera.size).camera
