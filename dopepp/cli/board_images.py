@@ -11,13 +11,7 @@ from dopepp.core.errors import Interruption, UserError, interruptible
 from dopepp.core.files import IMAGES
 from dopepp.drawing.pictures import RGBImage, Size, read_photo
 from dopepp.geometry.camera_file import read_camera
-from dopepp.robot.calibration.board import (
-    Board,
-    BoardDetection,
-    BoardPose,
-    board_pose,
-    parse_board,
-)
+from dopepp.robot.calibration.board import Board, BoardDetection, BoardPose, board_pose, parse_board
 from dopepp.robot.calibration.lens import CHECKS_PER_S, Views
 
 SUFFIXES = (*IMAGES, ".tif", ".tiff")
