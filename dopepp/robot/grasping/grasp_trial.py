@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -135,7 +135,7 @@ class SceneObservation:
     """Parts that the controller detected, and the arm's joints at the last image."""
 
     parts: list[EstimatedPart]  # sorted by descending height
-    joints: Joints  # joints of the arm at the last image, radians
+    joints: Joints
     second_view: str = ""  # as in :class:`Record`
 
 
@@ -195,12 +195,13 @@ class Trials:
         self._symmetries = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         self._raster = RasterView(task.renderer == "raster-shadows")
         self.robot = cache(self._robot)
-        self._parts_cell = cache(lambda count: Cell([self.layout.solid] * count))
-        self._parts_view = cache(lambda count: MujocoView([self.layout.solid] * count))
+        # Scenes of equal numbers of parts share their models.
+        self._cell = lru_cache(8)(lambda *solids: Cell(solids))
+        self._mujoco = lru_cache(8)(lambda *solids: MujocoView(solids))
 
     @cached_property
     def estimator(self) -> PoseEstimator:
-        """The task's network, with refinement if the task asks for it."""
+        """The task's network."""
         from dopepp.inference.estimator import PoseEstimator
 
         assert self.task.network is not None
@@ -211,8 +212,7 @@ class Trials:
         """Estimator that compares the image with templates of the part's mesh, without training."""
         from dopepp.inference.estimator import PoseEstimator
 
-        near, far = self.distance
-        distances = near / DISTANCE_MARGIN, far * DISTANCE_MARGIN
+        distances = self.distance[0] / DISTANCE_MARGIN, self.distance[1] * DISTANCE_MARGIN
         lies_flat = self.task.rest == "front" and self.task.layout != "heap"
         tilt_deg = FLAT_TILT_DEG if lies_flat else 180.0
         return PoseEstimator.from_mesh(self.task.part, self.task.unit, distances, tilt_deg)
@@ -241,19 +241,15 @@ class Trials:
         rng = np.random.default_rng([self.task.seed, number])
         robot, calibrated = self.robot(number // BLOCK)
         placed = self.layout.draw(rng)
-        # Models and renderers of scenes with parts only are cached.
-        is_parts_only = all(item.body.part is not None for item in placed)
-        solids, count = [item.solid for item in placed], len(placed)
-        cell = self._parts_cell(count) if is_parts_only else Cell(solids)
+        solids, bodies = [item.solid for item in placed], [item.body for item in placed]
+        cell = self._cell(*solids)
         state = cell.data()
         for index, item in enumerate(placed):
             cell.put(state, index, item.T_base_obj)
         joints, T_base_cam = self._aim_camera(robot, rng)
         poses = self._settle(cell, state, robot, joints)
-        view: RasterView | MujocoView = self._raster
-        if self.task.renderer == "mujoco":
-            view = self._parts_view(count) if is_parts_only else MujocoView(solids)
-        bodies, appearance = [item.body for item in placed], deepcopy(rng)
+        view = self._mujoco(*solids) if self.task.renderer == "mujoco" else self._raster
+        appearance = deepcopy(rng)
 
         def arrange(poses: Sequence[Transform]) -> Photographer:
             return view.arrange(bodies, poses, T_base_cam, deepcopy(appearance))
@@ -276,8 +272,7 @@ class Trials:
         when two successive attempts find no plan.
         """
         limit = len(scene.parts) + EXTRA_ATTEMPTS if self.task.layout == "heap" else 1
-        failed: list[Transform] = []
-        failure = ""
+        failed, failure = list[Transform](), ""
         while True:
             attempt = self.attempt(scene, source, failed)
             yield attempt
@@ -340,8 +335,8 @@ class Trials:
     def _planner(self, scene: TrialScene) -> Planner:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         tilts = TILTS.tolist() if self.task.layout == "heap" else [0.0]
-        knowledge = scene.calibrated.knowledge
-        return Planner(self.arm, self.gripper, self._parts_cell(count), knowledge, tilts)
+        cell = self._cell(*[self.layout.solid] * count)
+        return Planner(self.arm, self.gripper, cell, scene.calibrated.knowledge, tilts)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
         """Return the parts detected by a source, which takes one or two images if needed."""

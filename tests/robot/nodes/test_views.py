@@ -63,9 +63,8 @@ def poses_of(stereo, camera=None):
 
 
 @pytest.mark.parametrize("track", [False, True])
-def test_poses_are_those_of_predict_views_in_the_world(estimator, stereo, shots, track):
-    warnings = []
-    worker = ViewsWorker(estimator, poses_of(stereo), "bench", track=track, warn=warnings.append)
+def test_poses_are_those_of_predict_views_in_the_world(estimator, stereo, shots, track, warnings):
+    worker = ViewsWorker(estimator, poses_of(stereo), "bench", track=track)
     answer = worker.process(*shots())
     cameras = [stereo.K] * 2
     (expected,) = estimator.predict_views(stereo.images, cameras, stereo.poses).detections
@@ -87,9 +86,8 @@ def test_poses_are_those_of_predict_views_in_the_world(estimator, stereo, shots,
     assert not warnings
 
 
-def test_missing_transforms_and_cameras_are_one_warning(estimator, stereo, shots):
-    warnings = []
-    worker = ViewsWorker(estimator, None, warn=warnings.append)
+def test_missing_transforms_and_cameras_are_one_warning(estimator, stereo, shots, warnings):
+    worker = ViewsWorker(estimator, None)
 
     def missing(frame, stamp):
         raise UserError(f"no transform from world to {frame}", "TF", "publish it")
@@ -104,7 +102,7 @@ def test_missing_transforms_and_cameras_are_one_warning(estimator, stereo, shots
     assert len(worker.process(*shots(3)).detections) == 1
     assert worker.problem == ""
     wrong = Camera((320, 240), stereo.K, (), "small.yaml")
-    worker = ViewsWorker(estimator, poses_of(stereo, wrong), warn=warnings.append)
+    worker = ViewsWorker(estimator, poses_of(stereo, wrong))
     assert worker.process(*shots()) is None
     assert "small.yaml of 320×240, and images of 640×480" in warnings[-1]
     with pytest.raises(UserError, match="refine=false with images of several cameras"):
