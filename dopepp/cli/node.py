@@ -26,7 +26,6 @@ from dopepp.cli.common import (
 )
 from dopepp.core.errors import UserError, interruptible, require
 from dopepp.core.validation import Range, check
-from dopepp.robot.nodes.pairing import MAX_LAG_S
 
 LINES: Final = ("--json", "--udp")
 TOPIC: Final = "/camera/image_raw"
@@ -91,7 +90,7 @@ def node(
         for_several: dict[str, object] = {"--views": views, "--world": world, "--lag": lag}
         for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
         _check_topics(topics, transport, for_one if len(topics) > 1 else for_several)
-        max_lag_s = check("--lag", MAX_LAG_S if lag is None else lag, float, Range(0, 10))
+        lag = None if lag is None else check("--lag", lag, float, Range(0, 10))
         check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
@@ -124,9 +123,10 @@ def node(
         else:
             worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":
+            from dopepp.robot.nodes.image_queue import MAX_LAG_S
             from dopepp.robot.nodes.ros2 import run
 
-            run(worker, topics, name, params, max_lag_s)
+            run(worker, topics, name, params, MAX_LAG_S if lag is None else lag)
             return
 
         from dopepp.robot.nodes.standalone import process_bag, send_lines

@@ -41,8 +41,7 @@ from dopepp.robot.grasping.rehearsal import (
     downward_view,
     draw_robot,
 )
-from dopepp.robot.grasping.selection import EstimatedPart, choose_part
-from dopepp.robot.grasping.viewpoint import choose_viewpoint
+from dopepp.robot.grasping.selection import EstimatedPart, choose_part, choose_viewpoint
 from dopepp.robot.grasping.workbench import (
     Layout,
     MujocoView,

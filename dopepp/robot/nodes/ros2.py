@@ -1,8 +1,8 @@
 """A ROS 2 node, with the wheels of the package extra ``ros2`` or the rclpy of an installed ROS.
 
-The images of several cameras are paired by their stamps (:mod:`.pairing`) into sets.
+The images of several cameras are paired by their stamps (:mod:`.image_queue`) into sets.
 The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
-The worker runs in a thread, which the latest image reaches through a :class:`.slot.Slot`. Topics
+The worker runs in a thread and gets the latest image through a :class:`.image_queue.Slot`. Topics
 whose message types are not installed (``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
 """
 
@@ -24,6 +24,7 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import quaternion_to_matrix
 from dopepp.inference.frames.ros import info_topic
+from dopepp.robot.nodes.image_queue import MAX_LAG_S, Pace, Slot, StampPairing
 from dopepp.robot.nodes.messages import (
     DIAGNOSTICS,
     OVERLAY,
@@ -33,8 +34,6 @@ from dopepp.robot.nodes.messages import (
     Triangles,
     diagnosis,
 )
-from dopepp.robot.nodes.pairing import MAX_LAG_S, StampPairing
-from dopepp.robot.nodes.slot import Pace, Slot
 from dopepp.robot.nodes.views_worker import ViewsWorker
 from dopepp.robot.nodes.worker import Shot, Stamp, Worker, stamp_of
 

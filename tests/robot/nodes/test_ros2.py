@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dopepp.robot.nodes import slot as slot_module
+from dopepp.robot.nodes import image_queue
+from dopepp.robot.nodes.image_queue import Pace, Slot
 from dopepp.robot.nodes.messages import diagnosis, image_fields
 from dopepp.robot.nodes.ros2 import _Node, native
-from dopepp.robot.nodes.slot import Pace, Slot
 from dopepp.robot.nodes.worker import Stamp, Worker, WorkerSettings
 
 
@@ -126,7 +126,7 @@ def test_an_exception_of_the_thread_is_raised_again():
 def test_pace_measures_rate_and_latency(monkeypatch):
     seconds = iter(range(100))
     clock = SimpleNamespace(monotonic=lambda: next(seconds) / 10)
-    monkeypatch.setattr(slot_module, "time", clock)
+    monkeypatch.setattr(image_queue, "time", clock)
     pace = Pace()
     assert pace.values() == {"answered": "0"}
     for latency in (0.01, 0.02, 0.03):
