@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from dopepp.core.errors import RunError, UserError
+from dopepp.core.errors import RunError
 from dopepp.core.files import read_csv
 from dopepp.core.pool import LostWorkerError, ProcessPool
 from dopepp.robot.grasping import grasp_experiment, grasp_report
@@ -110,8 +110,6 @@ def test_equal_sources_are_used_once_and_a_curve_is_many_sources():
     names = [source.name for source in parse_sources("curve")]
     assert names[0] == "exact poses, off by 1 mm and 1°"
     assert len(set(names)) == len(names) == 6
-    with pytest.raises(UserError, match="--poses truth"):
-        parse_sources("exact,truth")
 
 
 def test_a_network_is_omitted_if_no_source_needs_it():
