@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -40,7 +40,10 @@ if TYPE_CHECKING:
     from dopepp.inference.frames import FrameSource
     from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.stream import StreamOptions
-    from dopepp.virtual.surface import Surface
+    from dopepp.parts.part import Part
+    from dopepp.recovery.detection import Detection
+
+    Verification = Callable[[PoseResult, Detection], float]
 
 
 def predict(
@@ -157,11 +160,7 @@ def predict(
 
             recordings = [rerun] * (rerun is not None) + [None] * show
             outputs += [(path or Path("viewer"), Viewer(estimator, path)) for path in recordings]
-        surfaces: dict[str, Surface] | None = None
-        if verify:
-            from dopepp.virtual.surface import make_surface
-
-            surfaces = {part.name: make_surface(part.mesh) for part in known_parts if part.mesh}
+        verification = _verification(known_parts) if verify else None
         options: StreamOptions = {
             "stride": stride,
             "track": track,
@@ -175,7 +174,7 @@ def predict(
         with Outputs(outputs) as written:
             for opened, its_camera in zip(sources, cameras, strict=True):
                 written.begin(opened)
-                _predict_source(estimator, opened, its_camera, options, surfaces, written)
+                _predict_source(estimator, opened, its_camera, options, verification, written)
 
 
 def _exclude(option: str, others: dict[str, object]) -> None:
@@ -190,16 +189,11 @@ def _predict_source(
     source: FrameSource,
     camera: Camera,
     options: StreamOptions,
-    surfaces: Mapping[str, Surface] | None,
+    verification: Verification | None,
     outputs: Outputs,
 ) -> None:
-    """Print the poses in each image of a source, and pass them to the outputs.
-
-    With ``surfaces`` of the parts, each line of JSON has an ``agreement`` in [0, 1], which states
-    how well the part's outline and creases agree with the image.
-    """
+    """Print the poses in each image of a source, and pass them to the outputs."""
     from dopepp.inference.pose_result import format_speed
-    from dopepp.virtual.agreement import agreement
 
     total = source.count and math.ceil(source.count / options["stride"])
     results = estimator.stream(source, camera=camera, **options)
@@ -208,9 +202,8 @@ def _predict_source(
         if not result.detections and source.rate is None and not options["track"]:
             result, reason = _search_again(estimator, camera, options, result)
         for record, detection in zip(result.records(), result.detections, strict=True):
-            if surfaces is not None:
-                pose, surface = detection.T_cam_obj, surfaces[detection.object]
-                record["agreement"] = agreement(result.image, result.K, pose, surface)
+            if verification is not None:
+                record["agreement"] = verification(result, detection)
             typer.echo(json.dumps(record, ensure_ascii=False))
         summary = result.summary
         if result.weaker:
@@ -220,6 +213,20 @@ def _predict_source(
         progress = f"{number}/{total or '…'} {Path(result.name).name}: " if total != 1 else ""
         typer.echo(f"{progress}{summary}; speed: {format_speed(result.speed)}", err=True)
         outputs.write(result)
+
+
+def _verification(parts: Sequence[Part]) -> Verification:
+    """Return how well outline and creases of a detected part agree with the image, 0 to 1."""
+    from dopepp.virtual.agreement import agreement
+    from dopepp.virtual.surface import make_surface
+
+    surfaces = {part.name: make_surface(part.mesh) for part in parts if part.mesh}
+
+    def verify(result: PoseResult, detection: Detection) -> float:
+        surface = surfaces[detection.object]
+        return agreement(result.image, result.K, detection.T_cam_obj, surface)
+
+    return verify
 
 
 def _search_again(

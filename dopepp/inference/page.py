@@ -175,7 +175,7 @@ def _outputs(
     if not detections and estimator.has_network:
         remark = f": {format_reasons(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
-    shared = {"shapes": shapes, "weaker": weaker, "min_score": estimator.min_score}
+    shared: dict[str, Any] = {"shapes": shapes, "weaker": weaker, "min_score": estimator.min_score}
     result = PoseResult(image, K, detections, {}, path.name, **shared)
     file = Path(mkdtemp(dir=folder), f"{path.stem}.json")
     write_file(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())

@@ -212,10 +212,10 @@ class Planner:
         return self._is_free(np.stack([start, end]), self._gripper.widest)
 
     def _place(self, poses: Sequence[Transform]) -> None:
-        """Place the model's parts at poses T_base_obj, and surplus parts away from the bench."""
+        """Place as many of the model's parts as possible at T_base_obj, and put others away."""
         for number in range(self._cell.count):
             self._cell.put_away(self._state, number)
-        for number, pose in enumerate(poses):
+        for number, pose in enumerate(poses[: self._cell.count]):
             self._cell.put(self._state, number, pose)
 
     def _tools(
