@@ -25,7 +25,7 @@ from dopepp.inference.several_views.views_result import WorldDetection
 from dopepp.parts.mesh import face_areas
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import Part
-from dopepp.robot.nodes.worker import Answer, Posed, Stamp
+from dopepp.robot.nodes.worker import Answer, Posed
 
 MARKER_FACES: Final = 1000  # largest number of triangles of a marker; its message has 36 kB
 
@@ -104,7 +104,7 @@ class AnswerFormatter:
 
     def messages(self, answer: Answer, is_wanted: Callable[[str], bool]) -> list[Message]:
         """Return the messages of an answer, for topics on which ``is_wanted`` returns true."""
-        header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
+        header = _header(answer.stamp, answer.frame_id)
         makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
             copies = [pose for pose in answer.detections if pose.object == name]
@@ -165,7 +165,7 @@ class AnswerFormatter:
         return {"markers": markers}
 
 
-def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> Message:
+def diagnosis(stamp: int, name: str, problem: str, values: dict[str, str]) -> Message:
     """Return the diagnostic message of a node; the level is OK if ``problem`` is empty."""
     status = {
         "level": WARN if problem else OK,
@@ -174,8 +174,12 @@ def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> 
         "hardware_id": "",
         "values": [{"key": key, "value": value} for key, value in values.items()],
     }
-    header = {"stamp": stamp._asdict(), "frame_id": ""}
-    return Message(*DIAGNOSTICS, {"header": header, "status": [status]})
+    return Message(*DIAGNOSTICS, {"header": _header(stamp, ""), "status": [status]})
+
+
+def _header(stamp: int, frame_id: str) -> Fields:
+    sec, nanosec = divmod(stamp, 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
 def image_fields(image: RGBImage, header: Fields) -> Fields:

@@ -35,7 +35,7 @@ from dopepp.robot.nodes.messages import (
     diagnosis,
 )
 from dopepp.robot.nodes.views_worker import ViewsWorker
-from dopepp.robot.nodes.worker import Shot, Stamp, Worker, stamp_of
+from dopepp.robot.nodes.worker import Shot, Worker, stamp_of
 
 QUEUE_IN: Final = 5  # a shorter queue loses images on a busy machine; a longer one delays them
 QUEUE_OUT: Final = 10
@@ -205,7 +205,7 @@ class _Node:
         shot = Shot(message, camera.info, camera.topic)
         shots: Sequence[Shot] | None = [shot]
         if self._pairing is not None:
-            shots = self._pairing.add(number, stamp_of(message.header.stamp).seconds, shot)
+            shots = self._pairing.add(number, stamp_of(message) / 1e9, shot)
         if shots is not None:
             self.slot.put(shots)
 
@@ -216,7 +216,7 @@ class _Node:
             return
         for message in self._formatter.messages(answer, self._is_wanted):
             self._publish(message)
-        self._pace.count(self._now() - answer.stamp.seconds)
+        self._pace.count((self._now() - answer.stamp) / 1e9)
         self._summary = answer.result.summary
 
     def _tick(self) -> None:
@@ -271,11 +271,9 @@ class _Node:
             values |= {"sets": str(pairing.num_sets), "dropped sets": str(pairing.dropped)}
             values["lag (ms)"] = "" if pairing.lag_s is None else f"{1e3 * pairing.lag_s:.1f}"
         values["last image"] = self._summary
-        now = self._now()
-        stamp = Stamp(int(now), int(1e9 * (now % 1)))
         silences = [camera.problem for camera in self._cameras]
         problems = [self._worker.problem, *silences, self._pairing_problem()]
-        return diagnosis(stamp, self._name, next(filter(None, problems), ""), values)
+        return diagnosis(self._now(), self._name, next(filter(None, problems), ""), values)
 
     def _is_best_effort(self, topic: str) -> bool:
         """Return whether a publisher of an image topic offers best-effort delivery only."""
@@ -297,9 +295,9 @@ class _Node:
         publisher = self._publishers.get(topic)
         return publisher is not None and publisher.get_subscription_count() > 0
 
-    def _now(self) -> float:
-        """Return the ROS clock's time, seconds (since 1970, unless time is simulated)."""
-        return float(self._clock.now().nanoseconds / 1e9)
+    def _now(self) -> int:
+        """Return the ROS clock's time, nanoseconds (since 1970, unless time is simulated)."""
+        return int(self._clock.now().nanoseconds)
 
 
 @contextmanager
@@ -313,7 +311,7 @@ def _ros_errors(source: str) -> Iterator[None]:
         raise UserError(f"{source}: {error!s:.300}", allowed, fix) from error
 
 
-def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]:
+def transform_lookup(node: Any, world: str) -> Callable[[str, int], Transform]:
     """Return a function that looks up the pose of a frame in the world in TF at a time.
 
     ``node`` is a node of rclpy, which receives the transforms.
@@ -333,10 +331,10 @@ def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]
     buffer = Buffer()
     buffer.listener = TransformListener(buffer, node)  # keeps the subscriptions alive
 
-    def look_up(frame: str, stamp: Stamp) -> Transform:
-        time = Time(seconds=stamp.sec, nanoseconds=stamp.nanosec)
+    def look_up(frame: str, stamp: int) -> Transform:
+        time, wait = Time(nanoseconds=stamp), Duration(seconds=WAIT_S)
         try:
-            answer = buffer.lookup_transform(world, frame, time, Duration(seconds=WAIT_S))
+            answer = buffer.lookup_transform(world, frame, time, wait)
         except Exception as error:  # TF raises many types
             problem = f"no transform from {world} to {frame} ({error!s:.200})"
             fix = "publish it, choose another --world, or pass --views rig.yaml"

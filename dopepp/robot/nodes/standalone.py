@@ -22,7 +22,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.frames import FrameSource
 from dopepp.inference.frames.ros import Bag
 from dopepp.robot.nodes.messages import OVERLAY, VISION, AnswerFormatter, Fields, Triangles
-from dopepp.robot.nodes.worker import Answer, Shot, Stamp, Worker, stamp_of
+from dopepp.robot.nodes.worker import Answer, Shot, Worker, stamp_of
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -121,10 +121,7 @@ def process_bag(
         for seconds, message, info in bag.messages():
             answer = worker.process(Shot(message, info, bag.topic))
             if answer is not None:
-                stamp = stamp_of(message.header.stamp)
-                if stamp == Stamp(0, 0):
-                    stamp = Stamp(int(seconds), int(1e9 * (seconds - int(seconds))))
-                recorder.write(answer, stamp)
+                recorder.write(answer, stamp_of(message) or round(1e9 * seconds))
             yield answer
 
 
@@ -161,13 +158,12 @@ class _Recorder:
         if kind is None:
             next(self._folder.glob(f"*{SUFFIX}")).replace(self._path)
 
-    def write(self, answer: Answer, stamp: Stamp) -> None:
-        """Write the messages of an answer with the recording time ``stamp``."""
+    def write(self, answer: Answer, stamp: int) -> None:
+        """Write the messages of an answer with the recording time ``stamp``, nanoseconds."""
         for message in self._formatter.messages(answer, self._topics.__contains__):
             kind = _ros2_kind(message.kind)
             content = self._store.serialize_cdr(_filled(self._store, kind, message.fields), kind)
-            nanoseconds = stamp.sec * 10**9 + stamp.nanosec
-            self._writer.write(self._topics[message.topic], nanoseconds, content)
+            self._writer.write(self._topics[message.topic], stamp, content)
 
 
 def _ros2_kind(kind: str) -> str:

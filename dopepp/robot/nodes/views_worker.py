@@ -10,7 +10,7 @@ from dopepp.geometry.camera import Transform
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.several_views.view_files import CameraPose
 from dopepp.inference.several_views.views_tracker import ViewsTracker
-from dopepp.robot.nodes.worker import Answer, Shot, Stamp, Worker, WorkerSettings
+from dopepp.robot.nodes.worker import Answer, Shot, Worker, WorkerSettings
 
 WORLD: Final = "world"  # default name of the frame of all poses
 
@@ -30,8 +30,8 @@ class ViewsWorker(Worker):
         UserError: The estimator does not support the settings.
     """
 
-    look_up: Callable[[str, Stamp], Transform]
-    """Returns the pose of a camera's optical frame in the world at a time, e.g. from TF."""
+    look_up: Callable[[str, int], Transform]
+    """Returns the pose of a camera's optical frame in the world at a stamp, e.g. from TF."""
 
     def __init__(
         self,

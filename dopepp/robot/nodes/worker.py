@@ -32,18 +32,6 @@ logger = logging.getLogger(__name__)
 Posed = Detection | WorldDetection  # detection in the frame of a camera, or in the world
 
 
-class Stamp(NamedTuple):
-    """Time of an image as in ROS: whole seconds since 1970, plus nanoseconds."""
-
-    sec: int
-    nanosec: int
-
-    @property
-    def seconds(self) -> float:
-        """Time since 1970 as a single number, seconds."""
-        return self.sec + self.nanosec / 1e9
-
-
 @dataclass(frozen=True)
 class WorkerSettings:
     """Settings of a worker that may change while it runs."""
@@ -63,7 +51,7 @@ class WorkerSettings:
 class Answer:
     """Poses in an image, with the time and frame for ROS messages."""
 
-    stamp: Stamp  # capture time of the image
+    stamp: int  # capture time of the image, nanoseconds since 1970
     frame_id: str  # reference frame: the camera's optical frame, or the world of several cameras
     result: PoseResult | ViewsResult
 
@@ -100,7 +88,7 @@ class Decoded:
     frame: CameraFrame
     camera: Camera
     is_cropped: bool
-    stamp: Stamp
+    stamp: int
     frame_id: str  # name of the camera's optical frame
 
 
@@ -130,7 +118,7 @@ class Worker:
         self._camera, self._frame_id = camera, frame_id
         self._tracker = PoseTracker(self._estimator(True)) if track else None
         self._warned: set[str] = set()
-        self._last: Stamp | None = None
+        self._last = 0  # stamp of the last image, nanoseconds
         self._number, self._num_without_info = 0, dict[str, int]()
         self._shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
         self.problem = ""
@@ -173,7 +161,7 @@ class Worker:
             return None
         return self._answer(decoded.stamp, decoded.frame_id, result)
 
-    def _answer(self, stamp: Stamp, frame_id: str, result: PoseResult | ViewsResult) -> Answer:
+    def _answer(self, stamp: int, frame_id: str, result: PoseResult | ViewsResult) -> Answer:
         """Return an answer, and count it."""
         self.problem = ""
         self._number += 1
@@ -201,7 +189,7 @@ class Worker:
                 problem += "pass --camera camera.yaml (from `dopepp calibrate camera`)"
                 self._reject(f"no info {topic}", problem)
             return None
-        stamp = stamp_of(message.header.stamp)
+        stamp = stamp_of(message)
         frame_id = self._checked_frame(message.header.frame_id, lens, topic)
         try:
             camera = given or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
@@ -210,7 +198,7 @@ class Worker:
             self._reject("camera", str(error))
             return None
         is_cropped = given is None and lens is not None and lens.roi is not None
-        frame = CameraFrame(image, topic, self._number, stamp.seconds)
+        frame = CameraFrame(image, topic, self._number, stamp / 1e9)
         return Decoded(frame, camera, is_cropped, stamp, frame_id)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
@@ -258,17 +246,17 @@ class Worker:
             self._warn(f"frame {topic}", f"{images}, {problem}; {fix}")
         return frame_id
 
-    def _check_time(self, stamp: Stamp, topic: str) -> None:
+    def _check_time(self, stamp: int, topic: str) -> None:
         """Warn about zero or decreasing stamps; restart the tracking after a decrease."""
-        last, self._last = self._last, stamp
-        if stamp == Stamp(0, 0):
+        decrease_s, self._last = (self._last - stamp) / 1e9, stamp
+        if not stamp:
             problem = f"images on {topic} without a stamp, which TF needs: "
             self._warn("no stamp", f"{problem}let the driver set header.stamp")
-        elif last is not None and stamp < last:
+        elif decrease_s > 0:
             self._warn(
                 "back",
-                f"stamps on {topic} went back by {last.seconds - stamp.seconds:.3f} s: a restarted "
-                "recording or simulation, or two cameras on one topic? Parts are detected again",
+                f"stamps on {topic} went back by {decrease_s:.3f} s: a restarted recording or "
+                "simulation, or two cameras on one topic? Parts are detected again",
             )
             self._restart()
 
@@ -299,6 +287,6 @@ def check_size(camera: Camera, image: RGBImage) -> None:
         raise UserError(f"{camera.source} of {sizes}", "a camera of the images' size", fix)
 
 
-def stamp_of(stamp: Any) -> Stamp:
-    """Return the :class:`Stamp` of a ROS message's ``header.stamp``."""
-    return Stamp(int(stamp.sec), int(stamp.nanosec))
+def stamp_of(message: Any) -> int:
+    """Return the stamp in the header of a ROS message, nanoseconds since 1970."""
+    return 10**9 * int(message.header.stamp.sec) + int(message.header.stamp.nanosec)

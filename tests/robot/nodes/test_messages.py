@@ -11,7 +11,7 @@ from dopepp.geometry.camera import make_transform
 from dopepp.inference.pose_result import PoseResult
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.messages import MARKER_FACES, AnswerFormatter, diagnosis
-from dopepp.robot.nodes.worker import Answer, Stamp
+from dopepp.robot.nodes.worker import Answer
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def answer(camera, parts):
         estimate = T, nowhere, nowhere, 1.0, half @ half.T
         detections.append(Detection(parts[0].name, score, score, *estimate))
     result = PoseResult(camera.images[0], camera.K, detections, {}, "/camera/image_raw")
-    return Answer(Stamp(7, 5), "camera_optical_frame", result)
+    return Answer(7 * 10**9 + 5, "camera_optical_frame", result)
 
 
 def transform(pose):
@@ -105,7 +105,7 @@ def test_names_are_converted_for_topics_or_rejected(answer, parts):
 
 def test_a_diagnosis_warns_of_a_problem():
     fine, bad = (
-        diagnosis(Stamp(1, 2), "dope", problem, {"rate": "3"}).fields["status"][0]
+        diagnosis(10**9, "dope", problem, {"rate": "3"}).fields["status"][0]
         for problem in ("", "oh")
     )
     assert (fine["level"], bad["level"], bad["message"]) == (0, 1, "oh")

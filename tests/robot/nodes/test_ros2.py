@@ -13,12 +13,12 @@ from dopepp.robot.nodes import image_queue
 from dopepp.robot.nodes.image_queue import Pace, Slot
 from dopepp.robot.nodes.messages import diagnosis, image_fields
 from dopepp.robot.nodes.ros2 import _Node, native
-from dopepp.robot.nodes.worker import Stamp, Worker, WorkerSettings
+from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
 
 def test_messages_are_converted_to_native_messages():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
-    message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
+    message = diagnosis(3 * 10**9 + 4, "dope", "oh", {"rate": "30"})
     filled = native(message.kind, message.fields)
     assert (filled.header.stamp.sec, filled.status[0].level) == (3, b"\x01")
     assert filled.status[0].values[0].value == "30"
