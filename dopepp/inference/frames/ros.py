@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,7 +19,7 @@ import numpy as np
 from dopepp.core.errors import UserError, require
 from dopepp.drawing.pictures import MAX_PIXELS, RGBImage, whole_image
 from dopepp.geometry.camera import crop_camera, resize_camera
-from dopepp.geometry.camera_file import Camera, Crop, camera_of_fields
+from dopepp.geometry.camera_file import Camera, camera_of_fields
 from dopepp.inference.frames.source import CameraFrame, FrameSource
 
 if TYPE_CHECKING:
@@ -83,62 +82,47 @@ def info_topic(topic: str) -> str:
     return f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
 
 
-@dataclass(frozen=True)
-class CameraInfo:
-    """Content of a ``camera_info`` message."""
+def is_cropped(info: Any) -> bool:
+    """Return whether the images of a ``camera_info`` message show a region of the sensor."""
+    return bool(info.roi.width and info.roi.height)
 
-    size: tuple[int, int]  # (width, height) of the sensor's image, which K and P belong to
-    model: str  # distortion model
-    D: Sequence[float]  # distortion coefficients
-    K: Sequence[float]  # camera matrix, row by row
-    P: Sequence[float]  # 3×4 projection matrix of undistorted images, row by row
-    binning: tuple[int, int] = (1, 1)  # sensor pixels per image pixel, across and down
-    roi: Crop | None = None  # region of the sensor that is read out; None is the whole sensor
-    frame_id: str = ""  # camera frame
 
-    @classmethod
-    def from_message(cls, message: Any) -> CameraInfo:
-        """Read a message of ROS 1 (fields D, K, P) or ROS 2 (d, k, p)."""
-        matrices = {}
-        for name in ("D", "K", "P"):
-            values = getattr(message, name if hasattr(message, name) else name.lower())
-            matrices[name] = [float(value) for value in values]
-        roi = message.roi
-        crop = (int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
-        return cls(
-            (int(message.width), int(message.height)),
-            message.distortion_model,
-            **matrices,
-            binning=(max(1, int(message.binning_x)), max(1, int(message.binning_y))),
-            roi=crop if crop[2] and crop[3] else None,
-            frame_id=message.header.frame_id,
+def camera_of_info(info: Any, source: str, rectified: bool) -> Camera:
+    """Return the pinhole camera of a ``camera_info`` message of ROS 1 (D, K, P) or 2 (d, k, p).
+
+    Of undistorted images (``rectified``), P applies instead of K. K and P belong to the sensor's
+    image, of which the region of interest may be read out, with binning.
+
+    Raises:
+        UserError: The camera is not calibrated, or is not a pinhole camera.
+        ValueError: A field has a wrong type or length.
+    """
+
+    def numbers(name: str) -> list[float]:
+        return [float(x) for x in getattr(info, name if hasattr(info, name) else name.lower())]
+
+    if not any(numbers("K")):
+        raise UserError(
+            f"{source}, whose K is all zeros",
+            "the camera_info of a calibrated camera",
+            "calibrate it (`dopepp calibrate camera`) and give the driver the file, or pass it "
+            "here: --camera camera.yaml",
         )
-
-    def camera(self, source: str, rectified: bool) -> Camera:
-        """Return the pinhole camera of the images; of undistorted images, P applies instead of K.
-
-        Raises:
-            UserError: The camera is not calibrated, or is not a pinhole camera.
-        """
-        if not any(self.K):
-            raise UserError(
-                f"{source}, whose K is all zeros",
-                "the camera_info of a calibrated camera",
-                "calibrate it (`dopepp calibrate camera`) and give the driver the file, or pass it "
-                "here: --camera camera.yaml",
-            )
-        fields: dict[str, object] = {"image_width": self.size[0], "image_height": self.size[1]}
-        if rectified:
-            fields["K"] = np.reshape(self.P, (3, 4))[:, :3].ravel().tolist()
-        else:
-            fields |= {"K": [*self.K], "D": [*self.D], "distortion_model": self.model}
-        sensor = camera_of_fields(fields, source)
-        if self.roi is None and self.binning == (1, 1):
-            return sensor
-        x, y, width, height = self.roi or (0, 0, *self.size)
-        across, down = self.binning
-        K = resize_camera(crop_camera(sensor.K, x, y), 1 / across, 1 / down)
-        return Camera((width // across, height // down), K, sensor.distortion, source)
+    region = 0, 0, int(info.width), int(info.height)
+    fields: dict[str, object] = {"image_width": region[2], "image_height": region[3]}
+    if rectified:
+        fields["K"] = np.reshape(numbers("P"), (3, 4))[:, :3].ravel().tolist()
+    else:
+        lens = {"D": numbers("D"), "distortion_model": info.distortion_model}
+        fields |= {"K": numbers("K"), **lens}
+    sensor = camera_of_fields(fields, source)
+    if is_cropped(info):
+        roi = info.roi
+        region = int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+    x, y, width, height = region
+    across, down = max(1, int(info.binning_x)), max(1, int(info.binning_y))
+    K = resize_camera(crop_camera(sensor.K, x, y), 1 / across, 1 / down)
+    return Camera((width // across, height // down), K, sensor.distortion, source)
 
 
 class Bag(FrameSource):
@@ -176,8 +160,7 @@ class Bag(FrameSource):
         """Camera of the images' ``camera_info``; None if the recording has none."""
         topic = info_topic(self.topic)
         for _, message in self._messages([topic], CAMERA):
-            info = CameraInfo.from_message(message)
-            return info.camera(f"{self._path} {topic}", is_rectified(self.topic))
+            return camera_of_info(message, f"{self._path} {topic}", is_rectified(self.topic))
         return None
 
     def messages(self) -> Iterator[tuple[float, Any, Any | None]]:

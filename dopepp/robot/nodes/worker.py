@@ -18,7 +18,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
-from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
+from dopepp.inference.frames.ros import camera_of_info, decode_image, is_cropped, is_rectified
 from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
 from dopepp.inference.tracker import PoseTracker
@@ -176,13 +176,8 @@ class Worker:
             fix = "configure the driver to send rgb8, bgr8 or JPEG"
             self._reject(f"image {topic}", f"an image of {topic}: {error!s:.300}; fix: {fix}")
             return None
-        try:
-            lens = None if info is None else CameraInfo.from_message(info)
-        except Exception as error:
-            self._reject(f"info {topic}", f"the camera_info of {topic}: {error!s:.300}")
-            return None
         missing = self._num_without_info.pop(topic, 0) + 1
-        if lens is None and given is None:
+        if info is None and given is None:
             self._num_without_info[topic] = missing
             if missing == PATIENCE:
                 problem = f"images on {topic} without camera_info: let the driver publish it, or "
@@ -190,16 +185,19 @@ class Worker:
                 self._reject(f"no info {topic}", problem)
             return None
         stamp = stamp_of(message)
-        frame_id = self._checked_frame(message.header.frame_id, lens, topic)
+        frame_id = self._checked_frame(message.header.frame_id, info, topic)
         try:
-            camera = given or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
+            source = f"camera_info of {topic}"
+            camera = given or camera_of_info(info, source, is_rectified(topic))
             check_size(camera, image)
-        except ValueError as error:  # a wrong value (UserError), or fields of wrong lengths
+        except UserError as error:
             self._reject("camera", str(error))
             return None
-        is_cropped = given is None and lens is not None and lens.roi is not None
+        except Exception as error:  # fields of wrong types or lengths
+            self._reject(f"info {topic}", f"the camera_info of {topic}: {error!s:.300}")
+            return None
         frame = CameraFrame(image, topic, self._number, stamp / 1e9)
-        return Decoded(frame, camera, is_cropped, stamp, frame_id)
+        return Decoded(frame, camera, given is None and is_cropped(info), stamp, frame_id)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
         """Estimate the poses in an image with the current settings, after undistorting it.
@@ -230,7 +228,7 @@ class Worker:
             image, camera.K, detections, speed, *source, ids, self._shapes, weaker, threshold
         )
 
-    def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:
+    def _checked_frame(self, frame_id: str, info: Any | None, topic: str) -> str:
         """Return the name of the poses' frame; warn if it does not contain "optical"."""
         if self._frame_id is not None:
             return self._frame_id
@@ -238,8 +236,9 @@ class Worker:
         if OPTICAL not in frame_id:
             problem = "which is not named as an optical frame; "
             problem += "a pose's frame has x right, y down and z forward"
-        elif info is not None and info.frame_id not in ("", frame_id):
-            problem = f"their camera_info in {info.frame_id!r:.80}; the images' frame is used"
+        elif info is not None and info.header.frame_id not in ("", frame_id):
+            other = info.header.frame_id
+            problem = f"their camera_info in {other!r:.80}; the images' frame is used"
         if problem:
             images = f"images on {topic} are in frame {frame_id!r:.80}"
             fix = "name the camera's optical frame: --frame camera_optical_frame"
