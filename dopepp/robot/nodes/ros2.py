@@ -130,8 +130,8 @@ class _Node:
         for published, kind in (*self._formatter.topics(), DIAGNOSTICS):
             self._advertise(published, kind)
         self.slot: Slot[Sequence[Shot]] = Slot(self._answer)
-        for number in range(len(topics)):
-            self._subscribe(number)
+        for camera in self._cameras:
+            self._subscribe(camera)
         self._summary, self._has_warned = "", False
         self.handle.create_timer(1.0, self._tick)
 
@@ -173,38 +173,30 @@ class _Node:
             return
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
-    def _subscribe(self, number: int) -> None:
+    def _subscribe(self, camera: _Camera) -> None:
         """Replace the subscriptions to a camera's images and their ``camera_info``."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-        camera = self._cameras[number]
         policy = ReliabilityPolicy.RELIABLE if camera.is_reliable else ReliabilityPolicy.BEST_EFFORT
-        compressed = camera.topic.endswith("/compressed")
-        image = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
-        info = type_of("sensor_msgs/CameraInfo")
+        image = "CompressedImage" if camera.topic.endswith("/compressed") else "Image"
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
         for subscription in camera.subscriptions:
             self.handle.destroy_subscription(subscription)
         # This order delivers the camera_info before its image.
-        handlers = {
-            info_topic(camera.topic): (info, partial(self._take_info, number)),
-            camera.topic: (image, partial(self._take_image, number)),
-        }
+        kinds = {"CameraInfo": info_topic(camera.topic), image: camera.topic}
+        takers = partial(setattr, camera, "info"), partial(self._take_image, camera)
         camera.subscriptions = [
-            self.handle.create_subscription(kind, topic, handler, qos)
-            for topic, (kind, handler) in handlers.items()
+            self.handle.create_subscription(type_of(f"sensor_msgs/{kind}"), topic, take, qos)
+            for (kind, topic), take in zip(kinds.items(), takers, strict=True)
         ]
 
-    def _take_info(self, number: int, message: Any) -> None:
-        self._cameras[number].info = message
-
-    def _take_image(self, number: int, message: Any) -> None:
+    def _take_image(self, camera: _Camera, message: Any) -> None:
         """Pass an image, or the set that it completes, to the worker's thread."""
-        camera = self._cameras[number]
         camera.received += 1
         shot = Shot(message, camera.info, camera.topic)
         shots: Sequence[Shot] | None = [shot]
         if self._pairing is not None:
+            number = self._cameras.index(camera)
             shots = self._pairing.add(number, stamp_of(message) / 1e9, shot)
         if shots is not None:
             self.slot.put(shots)
@@ -222,22 +214,21 @@ class _Node:
     def _tick(self) -> None:
         """Publish the diagnostics, once a second, and check each camera."""
         self._publish(self._diagnosis())
-        for number in range(len(self._cameras)):
-            self._check_silence(number)
+        for camera in self._cameras:
+            self._check_silence(camera)
         if self._pairing_problem() and not self._has_warned:
             self._has_warned = True
             logger.warning("%s", self._pairing_problem())
 
-    def _check_silence(self, number: int) -> None:
+    def _check_silence(self, camera: _Camera) -> None:
         """If a camera has no new images, try best effort once, then warn."""
-        camera = self._cameras[number]
         is_silent = camera.received == camera.received_before
         camera.received_before = camera.received
         camera.silent_s = camera.silent_s + 1 if is_silent else 0
         if not camera.received and camera.is_reliable and self._is_best_effort(camera.topic):
             camera.is_reliable = False
             logger.warning("%s is published best effort: images may be lost", camera.topic)
-            self._subscribe(number)
+            self._subscribe(camera)
         elif camera.silent_s == SILENT_S:
             overlay, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
             topics = self.handle.get_topic_names_and_types()

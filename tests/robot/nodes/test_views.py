@@ -165,9 +165,9 @@ def test_node_publishes_world_poses_and_names_its_problems(estimator, stereo, sh
         assert problem(node)[0] == "no image on /left/image_raw"
 
         def send(second, lag):
-            for number, shot in enumerate(shots(second, lag)):
-                node._take_info(number, shot.info)
-                node._take_image(number, shot.message)
+            for camera, shot in zip(node._cameras, shots(second, lag), strict=True):
+                camera.info = shot.info
+                node._take_image(camera, shot.message)
 
         for second in range(1, 3 + UNPAIRED):
             send(second, 0.05)
