@@ -21,7 +21,7 @@ from dopepp.cli import (
     node,
     predict,
 )
-from dopepp.core.errors import UserError
+from dopepp.core.errors import Interruption, RunError, UserError
 
 COMMANDS: Final = (
     predict.predict,
@@ -44,16 +44,19 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class _OneLineErrors(TyperGroup):
-    """Group of commands that reports a wrong option or a missing argument in one line."""
+    """Group of commands that reports every expected error in one line on stderr."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; print a usage error as one line and exit with code 2."""
+        """Run a command; exit with the code of its error."""
         try:
             return super().invoke(ctx)
         except _UsageError as error:
             line = " ".join(error.format_message().split())  # type: ignore[attr-defined]
-            typer.echo(f"{line.rstrip('.')}; see --help", err=True)
-            raise typer.Exit(UserError.exit_code) from error
+            line, code = f"{line.rstrip('.')}; see --help", UserError.exit_code
+        except (UserError, RunError, Interruption) as error:
+            line, code = str(error), error.exit_code
+        typer.echo(line, err=True)
+        raise typer.Exit(code)
 
 
 app = typer.Typer(cls=_OneLineErrors, no_args_is_help=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, cast
@@ -10,15 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Final, cast
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import report_errors
-from dopepp.core.errors import Interruption, UserError, check_choice, interruptible
+from dopepp.core.errors import UserError, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dopepp.drawing.pictures import RGBImage, Size
-    from dopepp.geometry.camera import Transform
-    from dopepp.robot.calibration.board import Board, BoardDetection, BoardPose
+    from dopepp.robot.calibration.board import BoardPose
     from dopepp.robot.calibration.hand_eye import HandEye, Mount
     from dopepp.robot.calibration.lens import LensCalibration
     from dopepp.robot.calibration.quality import CalibrationQuality
@@ -33,7 +29,6 @@ Force = Annotated[
     bool, Option("--force", help="Write even a doubtful calibration, marked as not trusted.")
 ]
 BoardSpec = Annotated[str, Option("--board", help=BOARD)]
-Images = Annotated[Path, Argument(help="Folder with images of the board.")]
 Poses = Annotated[
     Path, Argument(help="CSV, JSON or YAML: x y z and a quaternion, rotation vector or angles.")
 ]
@@ -55,8 +50,7 @@ def board(
     """Write a calibration board for printing at true scale."""
     from dopepp.robot.calibration.board import parse_board
 
-    with report_errors():
-        typer.echo(f"{out}: {parse_board(spec).write(out)}")
+    typer.echo(f"{out}: {parse_board(spec).write(out)}")
 
 
 @app.command()
@@ -73,22 +67,22 @@ def camera(
     force: Force = False,
 ) -> None:
     """Calibrate a camera from images of a board, and write a file for predict --camera."""
+    from dopepp.cli.board_images import detect_in_folder, detect_in_stream
     from dopepp.core.files import check_target
     from dopepp.robot.calibration.board import parse_board
     from dopepp.robot.calibration.lens import calibrate_lens, write_camera
     from dopepp.robot.calibration.records import check_trust
 
-    with report_errors():
-        check_target(out, (".yaml", ".yml"))
-        target = parse_board(board)
-        if Path(source).is_dir() and not (Path(source) / "metadata.yaml").exists():
-            detections, size = _detect_in_folder(Path(source), target)
-        else:
-            detections, size = _detect_in_stream(source, target)
-        calibration = calibrate_lens(detections, size)
-        _show_lens(calibration)
-        check_trust(calibration.findings, force)
-        write_camera(out, calibration.camera, not calibration.findings)
+    check_target(out, (".yaml", ".yml"))
+    target, folder = parse_board(board), Path(source)
+    if folder.is_dir() and not (folder / "metadata.yaml").exists():
+        detections, size = detect_in_folder(folder, target)
+    else:
+        detections, size = detect_in_stream(source, target)
+    calibration = calibrate_lens(detections, size)
+    _show_lens(calibration)
+    check_trust(calibration.findings, force)
+    write_camera(out, calibration.camera, not calibration.findings)
     typer.echo(f"written: {out}")
 
 
@@ -106,18 +100,17 @@ def tcp(
     from dopepp.robot.calibration.records import read_robot_poses, write_calibration
     from dopepp.robot.calibration.tool import find_tip
 
-    with report_errors():
-        pose_format = _pose_format(unit, angles, quaternion, direction)
-        tip = find_tip(read_robot_poses(poses).transforms(pose_format))
-        for number, residual in enumerate(tip.residuals, 1):
-            typer.echo(f"pose {number}: {1000 * residual:.2f} mm")
-        position, deviations = (
-            ", ".join(f"{1000 * value:.2f}" for value in vector)
-            for vector in (tip.position, tip.deviations)
-        )
-        typer.echo(f"tip at ({position}) mm in the flange frame, ± ({deviations}) mm")
-        values = {"tip": tip.position.tolist(), "deviations": tip.deviations.tolist()}
-        write_calibration(out, "tool", values, tip.findings, force)
+    pose_format = _pose_format(unit, angles, quaternion, direction)
+    tip = find_tip(read_robot_poses(poses).transforms(pose_format))
+    for number, residual in enumerate(tip.residuals, 1):
+        typer.echo(f"pose {number}: {1000 * residual:.2f} mm")
+    position, deviations = (
+        ", ".join(f"{1000 * value:.2f}" for value in vector)
+        for vector in (tip.position, tip.deviations)
+    )
+    typer.echo(f"tip at ({position}) mm in the flange frame, ± ({deviations}) mm")
+    values = {"tip": tip.position.tolist(), "deviations": tip.deviations.tolist()}
+    write_calibration(out, "tool", values, tip.findings, force)
     typer.echo(f"written: {out}")
 
 
@@ -150,27 +143,26 @@ def bench(
     from dopepp.robot.calibration.records import read_points, write_calibration
     from dopepp.robot.calibration.tool import find_bench
 
-    with report_errors():
-        pose_format = _pose_format(unit, angles, quaternion, direction)
-        if board is not None:
-            result, names = _bench_from_board(source, board, camera, hand_eye, poses, pose_format)
-        elif source.is_dir():
-            problem = f"{source}, which is a folder, without --board"
-            fix = "describe the board, e.g. --board charuco:8x11:20:15"
-            raise UserError(problem, "a CSV, or images with --board", fix)
-        else:
-            result = find_bench(read_points(source, unit))
-            names = [f"point {number}" for number in range(1, len(result.residuals) + 1)]
-        for name, residual in zip(names, result.residuals, strict=True):
-            typer.echo(f"{name}: {1000 * residual:+.2f} mm off the plane")
-        values = {"T_base_bench": transform_record(result.T_base_bench)}
-        write_calibration(out, "bench", values, result.findings, force)
+    pose_format = _pose_format(unit, angles, quaternion, direction)
+    if board is not None:
+        result, names = _bench_from_board(source, board, camera, hand_eye, poses, pose_format)
+    elif source.is_dir():
+        problem = f"{source}, which is a folder, without --board"
+        fix = "describe the board, e.g. --board charuco:8x11:20:15"
+        raise UserError(problem, "a CSV, or images with --board", fix)
+    else:
+        result = find_bench(read_points(source, unit))
+        names = [f"point {number}" for number in range(1, len(result.residuals) + 1)]
+    for name, residual in zip(names, result.residuals, strict=True):
+        typer.echo(f"{name}: {1000 * residual:+.2f} mm off the plane")
+    values = {"T_base_bench": transform_record(result.T_base_bench)}
+    write_calibration(out, "bench", values, result.findings, force)
     typer.echo(f"written: {out}")
 
 
 @app.command()
 def handeye(
-    images: Images,
+    images: Annotated[Path, Argument(help="Folder with images of the board.")],
     poses: Poses,
     board: BoardSpec,
     camera: Annotated[Path, Option(help="Camera file.")],
@@ -183,26 +175,26 @@ def handeye(
     force: Force = False,
 ) -> None:
     """Calibrate the camera's pose on the robot from images of a board and the robot's poses."""
+    from dopepp.cli.board_images import board_poses, image_names
     from dopepp.core.files import check_target
     from dopepp.robot.calibration.hand_eye import MOUNTS, calibrate_hand_eye
     from dopepp.robot.calibration.quality import assess, check_poses
     from dopepp.robot.calibration.records import match_images, read_robot_poses, write_calibration
 
-    with report_errors():
-        check_target(out, (".yaml", ".yml"))
-        check_choice("--mount", mount, MOUNTS)
-        checked_mount = cast("Mount", mount)
-        pose_format = _pose_format(unit, angles, quaternion, direction)
-        robot = read_robot_poses(poses)
-        rows = match_images(robot, _image_names(images))
-        boards = [pose for pose in _board_poses(images, board, camera) if pose.name in rows]
-        used_rows = [rows[pose.name] for pose in boards]
-        flanges = check_poses(robot, used_rows, pose_format, boards, checked_mount)
-        calibration = calibrate_hand_eye(flanges, boards, checked_mount)
-        quality = assess(flanges, boards, calibration)
-        _show_hand_eye(boards, calibration, quality)
-        record = _hand_eye_record(calibration, quality)
-        write_calibration(out, "hand-eye", record, quality.findings, force)
+    check_target(out, (".yaml", ".yml"))
+    check_choice("--mount", mount, MOUNTS)
+    checked_mount = cast("Mount", mount)
+    pose_format = _pose_format(unit, angles, quaternion, direction)
+    robot = read_robot_poses(poses)
+    rows = match_images(robot, image_names(images))
+    boards = [pose for pose in board_poses(images, board, camera) if pose.name in rows]
+    used_rows = [rows[pose.name] for pose in boards]
+    flanges = check_poses(robot, used_rows, pose_format, boards, checked_mount)
+    calibration = calibrate_hand_eye(flanges, boards, checked_mount)
+    quality = assess(flanges, boards, calibration)
+    _show_hand_eye(boards, calibration, quality)
+    record = _hand_eye_record(calibration, quality)
+    write_calibration(out, "hand-eye", record, quality.findings, force)
     typer.echo(f"written: {out}")
 
 
@@ -227,29 +219,40 @@ def rig(
     force: Force = False,
 ) -> None:
     """Calibrate the poses of two to eight fixed cameras, and write the file for predict --views."""
+    from os.path import relpath
+
     import numpy as np
 
+    from dopepp.cli.board_images import detect_in_folder
     from dopepp.core.files import check_target
     from dopepp.geometry.camera_file import read_camera
-    from dopepp.geometry.transform_file import read_transform
+    from dopepp.geometry.transform_file import read_transform, transform_record
     from dopepp.robot.calibration.board import parse_board
     from dopepp.robot.calibration.records import write_calibration
     from dopepp.robot.calibration.rig import calibrate_rig
 
-    with report_errors():
-        check_target(out, (".yaml", ".yml"))
-        target = parse_board(board)
-        T_base_first = np.eye(4) if hand_eye is None else read_transform(hand_eye, "T_base_cam")
-        boards, cameras = {}, {}
-        for images in sorted(path for path in folder.glob("*") if path.is_dir()):
-            detections, size = _detect_in_folder(images, target)
-            boards[images.name] = {detection.name: detection for detection in detections}
-            lens = read_camera(images.with_name(f"{images.name}.yaml"))
-            cameras[images.name] = lens.for_picture(size)
-        calibration = calibrate_rig(boards, cameras)
-        _show_rig(calibration)
-        record = _rig_record(calibration, T_base_first, folder, out)
-        write_calibration(out, "rig", record, calibration.findings, force)
+    check_target(out, (".yaml", ".yml"))
+    target = parse_board(board)
+    T_base_first = np.eye(4) if hand_eye is None else read_transform(hand_eye, "T_base_cam")
+    boards, cameras = {}, {}
+    for images in sorted(path for path in folder.glob("*") if path.is_dir()):
+        detections, size = detect_in_folder(images, target)
+        boards[images.name] = {detection.name: detection for detection in detections}
+        cameras[images.name] = read_camera(folder / f"{images.name}.yaml").for_picture(size)
+    calibration = calibrate_rig(boards, cameras)
+    _show_rig(calibration)
+    shift, rotation = calibration.deviations.max(axis=0)
+    views = {
+        name: {
+            "camera": relpath(folder / f"{name}.yaml", out.parent),
+            "T_world_cam": transform_record(T_base_first @ calibration.T_world_cam[number]),
+            "covariance": calibration.covariances[number].tolist(),
+            "error_px": float(calibration.errors_px[number]),
+        }
+        for number, name in enumerate(calibration.names)
+    }
+    record = {"camera_error": [float(shift), float(np.degrees(rotation))], "views": views}
+    write_calibration(out, "rig", record, calibration.findings, force)
     typer.echo(f"written: {out}")
 
 
@@ -264,110 +267,6 @@ def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> Pos
     return PoseFormat(unit, angles == "deg", quaternion, direction == "base-to-flange")
 
 
-def _image_names(folder: Path) -> list[str]:
-    """Return the file names of a folder's images, sorted by name.
-
-    Raises:
-        UserError: The folder has no images.
-    """
-    from dopepp.core.files import IMAGES
-
-    suffixes = (*IMAGES, ".tif", ".tiff")
-    names = sorted(path.name for path in folder.glob("*") if path.suffix.lower() in suffixes)
-    if not names:
-        allowed = f"a folder with {', '.join(suffixes)}"
-        fix = "pass the folder that holds the images"
-        raise UserError(f"{folder} without images", allowed, fix)
-    return names
-
-
-def _board_poses(folder: Path, spec: str, camera: Path) -> list[BoardPose]:
-    """Estimate the board's pose in each image that shows it; ``spec`` is the value of --board."""
-    from dopepp.geometry.camera_file import read_camera
-    from dopepp.robot.calibration.board import board_pose, parse_board
-
-    detections, size = _detect_in_folder(folder, parse_board(spec))
-    lens = read_camera(camera).for_picture(size)
-    return [board_pose(detection, lens) for detection in detections]
-
-
-def _detect_in_folder(folder: Path, board: Board) -> tuple[list[BoardDetection], Size]:
-    """Detect the board in a folder's images; return the detections and the images' common size."""
-    from dopepp.drawing.pictures import read_photo
-
-    detections: list[BoardDetection] = []
-    first_size, names = None, _image_names(folder)
-    for name in names:
-        image = read_photo(folder / name)
-        size = (image.shape[1], image.shape[0])
-        first_size = first_size or size
-        if size != first_size:
-            problem = f"{folder / name} of {size[0]}×{size[1]} pixels among images of "
-            problem += f"{first_size[0]}×{first_size[1]}"
-            fix = "delete the images of the other size"
-            raise UserError(problem, "images of one size", fix)
-        if detection := _detect_board(board, image, name, reports_missing=True):
-            detections.append(detection)
-    return _check_detections(detections, first_size, f"{folder}", len(names))
-
-
-def _detect_in_stream(source: str, board: Board) -> tuple[list[BoardDetection], Size]:
-    """Detect the board in a video or a camera stream, and keep distinct views of it.
-
-    The search ends with the stream, on Ctrl-C, or with 60 views. Returns views and image size.
-    """
-    from dopepp.inference.frames import open_sources
-    from dopepp.robot.calibration.lens import CHECKS_PER_S, Views
-
-    views, first_size, count = Views(0), None, 0
-    with suppress(Interruption), interruptible(""):
-        for opened in open_sources([source]):
-            is_live = opened.count is None
-            stride = 1 if is_live else max(1, round((opened.rate or 0) / CHECKS_PER_S))
-            for frame in opened.frames(stride):
-                size = (frame.image.shape[1], frame.image.shape[0])
-                if first_size is None:
-                    views, first_size = Views(size[0]), size
-                count += 1
-                name = Path(frame.name).name if opened.rate is None else f"frame {frame.number}"
-                if size == first_size:
-                    detection = _detect_board(board, frame.image, name)
-                    if detection is not None and views.add(detection):
-                        typer.echo(f"{name}: view {len(views.kept)}", err=True)
-                if views.is_full:
-                    break
-    detections = _check_detections(views.kept, first_size, source, count)
-    typer.echo(f"{len(views.kept)} distinct views in {count} images", err=True)
-    return detections
-
-
-def _detect_board(
-    board: Board, image: RGBImage, name: str, reports_missing: bool = False
-) -> BoardDetection | None:
-    """Detect the board in an image; print a line for two boards or (optionally) without a board."""
-    try:
-        detection = board.detect(image, name)
-    except UserError as error:
-        typer.echo(f"{name}: skipped, {error}", err=True)
-        return None
-    if detection is None and reports_missing:
-        typer.echo(f"{name}: no board", err=True)
-    return detection
-
-
-def _check_detections(
-    detections: list[BoardDetection], size: Size | None, source: str, count: int
-) -> tuple[list[BoardDetection], Size]:
-    """Return detections and image size; raise a ``UserError`` if no image shows the board."""
-    if not detections or size is None:
-        raise UserError(
-            f"{source}: no board in any of {count} images",
-            "images of the board described by --board",
-            "compare --board with the board: kind, numbers of columns and rows, dictionary",
-        )
-    return detections, size
-
-
 def _bench_from_board(
     folder: Path,
     spec: str,
@@ -377,6 +276,7 @@ def _bench_from_board(
     pose_format: PoseFormat,
 ) -> tuple[Bench, list[str]]:
     """Calibrate the bench from images of a board on it; return the bench and the images' names."""
+    from dopepp.cli.board_images import board_poses, image_names
     from dopepp.core.yaml import read_yaml
     from dopepp.geometry.transform_file import read_transform
     from dopepp.robot.calibration.board import parse_board
@@ -389,18 +289,17 @@ def _bench_from_board(
         raise UserError(problem, "--board with both --camera and --hand-eye", fix)
     content = read_yaml(hand_eye)
     record = content if isinstance(content, dict) else {}
-    on_flange = "T_flange_cam" in record
-    if on_flange != (poses is not None):
-        problem = f"{hand_eye} of a camera on the {'flange' if on_flange else 'bench'}, "
-        problem += "without --poses" if on_flange else "with --poses"
-        fix = "add --poses FILE with the robot's poses" if on_flange else "leave out --poses"
+    mount = "flange" if "T_flange_cam" in record else "bench"
+    if (mount == "flange") != (poses is not None):
+        problem = f"{hand_eye} of a camera on the {mount}, with{'out' * (not poses)} --poses"
+        fix = "leave out --poses" if poses else "add --poses FILE with the robot's poses"
         raise UserError(problem, "--poses if, and only if, the camera is on the flange", fix)
-    T_mount_cam = read_transform(hand_eye, "T_flange_cam" if on_flange else "T_base_cam")
-    boards = {pose.name: pose.T_cam_board for pose in _board_poses(folder, spec, camera)}
+    T_mount_cam = read_transform(hand_eye, "T_flange_cam" if poses else "T_base_cam")
+    boards = {pose.name: pose.T_cam_board for pose in board_poses(folder, spec, camera)}
     T_base_cam = dict.fromkeys(boards, T_mount_cam)
     if poses is not None:
         robot = read_robot_poses(poses)
-        flanges, rows = robot.transforms(pose_format), match_images(robot, _image_names(folder))
+        flanges, rows = robot.transforms(pose_format), match_images(robot, image_names(folder))
         T_base_cam = {name: flanges[row] @ T_mount_cam for name, row in rows.items()}
     used = [name for name in boards if name in T_base_cam]
     bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], parse_board(spec))
@@ -418,12 +317,9 @@ def _show_lens(calibration: LensCalibration) -> None:
     typer.echo(f"points cover {calibration.coverage:.0%} of the image:")
     for row in calibration.covered:
         typer.echo("  " + "".join("■ " if cell else "· " for cell in row))
-    K = calibration.camera.K
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    numbers = zip(values.items(), calibration.deviations, strict=True)
-    typer.echo(
-        ", ".join(f"{name} {value:.2f} ± {std:.2f}" for (name, value), std in numbers) + " px"
-    )
+    values = calibration.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    numbers = zip(("fx", "fy", "cx", "cy"), values, calibration.deviations, strict=True)
+    typer.echo(", ".join(f"{name} {value:.2f} ± {std:.2f}" for name, value, std in numbers) + " px")
     views = len(calibration.names)
     typer.echo(f"reprojection error {calibration.error_px:.3f} px over {views} views")
 
@@ -467,28 +363,6 @@ def _show_rig(calibration: Rig) -> None:
             line += f", {distance_mm:.1f} mm from {calibration.names[0]}, standard deviations "
             line += f"{1000 * shift:.2f} mm and {degrees(rotation):.3f}°"
         typer.echo(line)
-
-
-def _rig_record(
-    calibration: Rig, T_base_first: Transform, folder: Path, out: Path
-) -> dict[str, object]:
-    """Return the content of the rig file ``out``; ``T_base_first`` is the first camera's pose."""
-    from math import degrees
-    from os.path import relpath
-
-    from dopepp.geometry.transform_file import transform_record
-
-    shift, rotation = calibration.deviations.max(axis=0)
-    views = {
-        name: {
-            "camera": relpath(folder / f"{name}.yaml", out.parent),
-            "T_world_cam": transform_record(T_base_first @ calibration.T_world_cam[number]),
-            "covariance": calibration.covariances[number].tolist(),
-            "error_px": float(calibration.errors_px[number]),
-        }
-        for number, name in enumerate(calibration.names)
-    }
-    return {"camera_error": [float(shift), degrees(rotation)], "views": views}
 
 
 def _hand_eye_record(calibration: HandEye, quality: CalibrationQuality) -> dict[str, object]:

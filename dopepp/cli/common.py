@@ -1,16 +1,13 @@
-"""Options that several commands share, and how a command reports errors."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import typer
 from typer import Argument, Option
 
-from dopepp.core.errors import RESUME, Interruption, RunError, UserError, interruptible
+from dopepp.core.errors import UserError, check_choice
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
@@ -18,66 +15,50 @@ if TYPE_CHECKING:
 MODEL_HELP: Final = (
     "Checkpoint (best.ckpt of a run), released network, or mesh file of an untrained part."
 )
-
 Model = Annotated[Path, Argument(help=MODEL_HELP)]
-
 Intrinsics = Annotated[
     tuple[float, float, float, float] | None,
     Option("--K", help="fx fy cx cy in pixels (instead of --camera)."),
 ]
-
 CameraFile = Annotated[
     Path | None, Option(help="Camera file: ROS, OpenCV, BOP, COLMAP, or text with a 3×3 matrix.")
 ]
-
 KSize = Annotated[
     tuple[int, int] | None,
     Option("--K-size", help="Size of the calibrated image, if it was resized."),
 ]
-
 Crop = Annotated[
     tuple[int, int, int, int] | None,
     Option(help="x y width height, if the calibrated image was cropped."),
 ]
-
 Distances = Annotated[
     tuple[float, float] | None,
     Option("--distance", help="Distance range of the parts, metres (default: the training range)."),
 ]
-
 Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the image.")]
-
 Conf = Annotated[
     float | None,
     Option(help="Minimum score of a pose, 0 to 1 (default: the checkpoint's threshold)."),
 ]
-
 MaxMs = Annotated[
     float | None, Option(help="Time limit of the refinement per image, milliseconds.")
 ]
-
 ScaleError = Annotated[
     float | None,
     Option(help="Largest relative error of part size or focal length (default: 0.005)."),
 ]
-
 Track = Annotated[bool, Option("--track", help="Track the parts from frame to frame.")]
-
 Meshes = Annotated[
     list[str] | None, Option("--part", help="Replacement mesh: built-in part, file, or NAME=FILE.")
 ]
-
 Unit = Annotated[str | None, Option(help="Unit of the mesh files: mm, cm, m or inch.")]
-
 WorkingDistance = Annotated[
     str | None, Option(help="NEAR,FAR: distances of a part given by its mesh, metres.")
 ]
-
 Tilt = Annotated[
     float | None,
     Option(help="Largest angle between this part's z axis and the camera, degrees (default: 180)."),
 ]
-
 Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
 
 
@@ -93,7 +74,7 @@ def load_estimator(
 ) -> PoseEstimator:
     """Load a checkpoint, or make an estimator for a mesh, which always refines by region.
 
-    The arguments are the values of the options of the same names; see their help.
+    The arguments are the values of the options of the same names.
 
     Raises:
         UserError: The model is invalid, or an option does not apply to it.
@@ -103,76 +84,39 @@ def load_estimator(
     from dopepp.parts.mesh.read import READERS
 
     is_mesh = model.suffix.lower() in READERS or (str(model) in BUILTIN and not model.exists())
-    excluded = (
-        {"--part": parts, f"--device {device}": device != "cpu"}
-        if is_mesh
-        else {
-            "--working-distance": working_distance is not None,
-            "--tilt": tilt is not None,
-            "--unit": unit is not None and not parts,
-        }
-    )
-    for option, is_given in excluded.items():
-        if is_given:
-            kind, other = ("mesh", "checkpoint") if is_mesh else ("checkpoint", "mesh")
-            problem = f"{option} with the {kind} {model}"
-            raise UserError(problem, f"{option} with a {other}", f"leave out {option}")
+    kind, other = ("mesh", "checkpoint") if is_mesh else ("checkpoint", "mesh")
+    excluded = {
+        "--part": is_mesh and parts,
+        f"--device {device}": is_mesh and device != "cpu",
+        "--working-distance": not is_mesh and working_distance is not None,
+        "--tilt": not is_mesh and tilt is not None,
+        "--unit": not is_mesh and unit is not None and not parts,
+    }
+    for option in (option for option, is_given in excluded.items() if is_given):
+        problem = f"{option} with the {kind} {model}"
+        raise UserError(problem, f"{option} with a {other}", f"leave out {option}")
     if not is_mesh:
         return PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
     distances = None
     if working_distance is not None:
         allowed = "NEAR,FAR in metres"
         distances = two_numbers("--working-distance", working_distance, allowed, "0.3,0.5")
+    limits = {"max_ms": max_ms, "scale_error": scale_error}
     return PoseEstimator.from_mesh(
-        model,
-        unit,
-        distances,
-        180.0 if tilt is None else tilt,
-        max_ms=max_ms,
-        scale_error=scale_error,
+        model, unit, distances, 180.0 if tilt is None else tilt, **limits
     )
 
 
 def two_numbers(option: str, text: str, allowed: str, example: str) -> tuple[float, float]:
-    """Parse the value of an option that consists of two numbers with a comma between them.
-
-    Raises:
-        UserError: The text has another form; the message contains ``allowed`` and the example.
-    """
+    """Parse the value of an option that consists of two numbers with a comma between them."""
     try:
         first, second = map(float, text.split(","))
     except ValueError:
-        fix = f"write e.g. {option} {example}"
-        raise UserError(f"{option} {text}", allowed, fix) from None
+        raise UserError(f"{option} {text}", allowed, f"write e.g. {option} {example}") from None
     return first, second
 
 
 def check_region(refine: str | None) -> None:
-    """Check the value of ``--refine`` of a command that only offers refinement by region.
-
-    Raises:
-        UserError: The value is neither ``region`` nor None.
-    """
-    if refine not in (None, "region"):
-        raise UserError(f"--refine {refine}", "region", "pass --refine region, or leave it out")
-
-
-@contextmanager
-def report_errors() -> Iterator[None]:
-    """Convert expected errors in a ``with`` block to a line on stderr and the error's exit code."""
-    try:
-        yield
-    except (UserError, RunError, Interruption) as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(error.exit_code) from error
-
-
-@contextmanager
-def resumable(advice: str = RESUME) -> Iterator[None]:
-    """Like :func:`report_errors`; Ctrl-C and SIGTERM in the block are expected errors, too.
-
-    Args:
-        advice: Text at the end of the message about an interruption.
-    """
-    with report_errors(), interruptible(advice):
-        yield
+    """Check the value of ``--refine`` of a command that only offers refinement by region."""
+    if refine is not None:
+        check_choice("--refine", refine, ("region",))

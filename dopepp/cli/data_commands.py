@@ -9,7 +9,8 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperCommand
 
-from dopepp.cli.common import Unit, report_errors, resumable
+from dopepp.cli.common import Unit
+from dopepp.core.errors import interruptible
 
 
 class RenderCommand(TyperCommand):
@@ -75,7 +76,7 @@ def render(
     Run the same command again to continue after an interruption. Exit codes: 0 done; 1 stopped
     (disk full, a worker process died); 2 wrong input; 130 or 143 interrupted.
     """
-    with resumable():
+    with interruptible():
         from dopepp.data.render_job import make_job
         from dopepp.data.render_run import run
 
@@ -95,9 +96,7 @@ def render(
             views=views,
         )
         if preview:
-            from dopepp.data.render_preview import (
-                write_preview,  # fonts and drawing take a second
-            )
+            from dopepp.data.render_preview import write_preview  # imports fonts, which is slow
 
             typer.echo(write_preview(job, out))
         else:
@@ -114,8 +113,7 @@ def check(
     """
     from dopepp.data.check import check_dataset
 
-    with report_errors():
-        report = check_dataset(folder)
+    report = check_dataset(folder)
     typer.echo("\n".join(report.lines(most)))
     if not report.ok:
         raise typer.Exit(1)
@@ -133,7 +131,10 @@ def download(
 
     columns = (DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
-    with resumable(), Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with (
+        interruptible(),
+        Progress(*columns, console=console, disable=not console.is_terminal) as bar,
+    ):
         task = bar.add_task(name, total=None)
 
         def show(completed: int, total: int) -> None:
@@ -153,5 +154,4 @@ def symmetries(
     """Find a part's symmetries and print its entry for BOP's models_info.json."""
     from dopepp.data.part_symmetries import describe_symmetries
 
-    with report_errors():
-        typer.echo(describe_symmetries(part, unit, tolerance))
+    typer.echo(describe_symmetries(part, unit, tolerance))

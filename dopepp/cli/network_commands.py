@@ -28,10 +28,9 @@ from dopepp.cli.common import (
     WorkingDistance,
     check_region,
     load_estimator,
-    report_errors,
     two_numbers,
 )
-from dopepp.core.errors import UserError
+from dopepp.core.errors import Interruption, UserError, interruptible, require
 
 if TYPE_CHECKING:
     from dopepp.inference.benchmark import Timing
@@ -52,35 +51,38 @@ def benchmark(
     device: Device = "cpu",
 ) -> None:
     """Time the steps from an image to its poses, in milliseconds per frame."""
-    with report_errors():
-        from dopepp.core.pool import num_threads
-        from dopepp.drawing.pictures import read_photo
-        from dopepp.experiment.assembly.renders import validation_renders
-        from dopepp.geometry.camera import camera_matrix
-        from dopepp.inference.benchmark import time_frames
-        from dopepp.parts.catalogue import with_meshes
+    from dopepp.core.pool import num_threads
+    from dopepp.drawing.pictures import read_photo
+    from dopepp.experiment.assembly.renders import validation_renders
+    from dopepp.geometry.camera import camera_matrix
+    from dopepp.inference.benchmark import time_frames
+    from dopepp.parts.catalogue import with_meshes
 
-        if (image is None) != (intrinsics is None):
-            fix = "pass --image FILE --K FX FY CX CY, or leave out both"
-            raise UserError("only one of --image and --K", "both or neither", fix)
-        rows = []
-        for path in models:
-            estimator = load_estimator(path, device, unit, working_distance, tilt)
-            if image is not None and intrinsics is not None:
-                images = [(read_photo(image), camera_matrix(*intrinsics))]
-            elif not estimator.has_network:
-                fix = "pass an image and its camera: --image FILE --K FX FY CX CY"
-                raise UserError(f"{path} without --image", "an image, which a mesh requires", fix)
-            else:
-                source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
-                samples = map(source.sample, range(NUM_SCENES))
-                images = [(sample.image, sample.K) for sample in samples]
-            if refine is not None:
-                estimator = estimator.refining(refine, with_meshes(estimator.parts))
-            rows.append(_row(path, time_frames(estimator, images, frames)))
-        height, width, _ = images[-1][0].shape
-        typer.echo(f"{width}×{height} pixels, {frames} frames, {num_threads()} threads; ms")
-        _print_table(rows)
+    if (image is None) != (intrinsics is None):
+        fix = "pass --image FILE --K FX FY CX CY, or leave out both"
+        raise UserError("only one of --image and --K", "both or neither", fix)
+    rows = []
+    for path in models:
+        estimator = load_estimator(path, device, unit, working_distance, tilt)
+        if image is not None and intrinsics is not None:
+            images = [(read_photo(image), camera_matrix(*intrinsics))]
+        elif not estimator.has_network:
+            fix = "pass an image and its camera: --image FILE --K FX FY CX CY"
+            raise UserError(f"{path} without --image", "an image, which a mesh requires", fix)
+        else:
+            source = validation_renders(estimator.checkpoint, path, NUM_SCENES, SIZE)
+            samples = map(source.sample, range(NUM_SCENES))
+            images = [(sample.image, sample.K) for sample in samples]
+        if refine is not None:
+            estimator = estimator.refining(refine, with_meshes(estimator.parts))
+        rows.append(_row(path, time_frames(estimator, images, frames)))
+    height, width, _ = images[-1][0].shape
+    typer.echo(f"{width}×{height} pixels, {frames} frames, {num_threads()} threads; ms")
+    columns = {key: max(len(key), *(len(row[key]) for row in rows)) for key in rows[0]}
+    model_width = columns.pop("model")
+    for row in ({key: key for key in rows[0]}, *rows):
+        cells = [row[key].rjust(width) for key, width in columns.items()]
+        typer.echo("  ".join([row["model"].ljust(model_width), *cells]))
 
 
 def _row(path: Path, timing: Timing) -> dict[str, str]:
@@ -97,14 +99,6 @@ def _row(path: Path, timing: Timing) -> dict[str, str]:
         "frames/s": f"{1000 / p50:.1f}",
         "found": f"{timing.num_found:.1f}",
     }
-
-
-def _print_table(rows: list[dict[str, str]]) -> None:
-    """Print rows of :func:`_row` with aligned columns; the first column is the model."""
-    widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in rows[0]}
-    for row in ({key: key for key in rows[0]}, *rows):
-        cells = [row[key].rjust(width) for key, width in list(widths.items())[1:]]
-        typer.echo("  ".join([row["model"].ljust(widths["model"]), *cells]))
 
 
 def doctor(
@@ -137,46 +131,32 @@ def doctor(
     from dopepp.inference.frames.media import Images
     from dopepp.inference.frames.source import Lens, choose_camera
 
-    with report_errors():
-        check_region(refine)
-        shown_at = None if not centres and not empty else [_pixel(text) for text in centres or ()]
-        if centres and empty:
-            raise UserError(
-                "--at together with --empty", "only one of them", "leave out --at or --empty"
-            )
-        K = None if intrinsics is None else camera_matrix(*intrinsics)
-        lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
-        pixels = read_photo(image)
-        from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
-        from dopepp.parts.catalogue import with_meshes
+    check_region(refine)
+    if centres and empty:
+        fix = "leave out --at or --empty"
+        raise UserError("--at together with --empty", "only one of them", fix)
+    shown_at = [two_numbers("--at", text, "u,v in pixels", "412,230") for text in centres or ()]
+    K = None if intrinsics is None else camera_matrix(*intrinsics)
+    lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
+    pixels = read_photo(image)
+    from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
+    from dopepp.parts.catalogue import with_meshes
 
-        estimator = load_estimator(model, device, unit, working_distance, tilt, parts)
-        solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
-        estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
-        try:
-            case = Case(
-                estimator,
-                *lens.undistort(pixels),
-                solid_parts,
-                distance,
-                crop is not None,
-                shown_at,
-            )
-        except UserError as error:
-            problem = f"{error.got}; allowed: {error.allowed}"
-            findings = [Diagnosis("camera", problem, error.fix)]
-        else:
-            findings = diagnose(case)
+    estimator = load_estimator(model, device, unit, working_distance, tilt, parts)
+    solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
+    estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
+    given = distance, crop is not None, shown_at if shown_at or empty else None
+    try:
+        case = Case(estimator, *lens.undistort(pixels), solid_parts, *given)
+    except UserError as error:
+        findings = [Diagnosis("camera", f"{error.got}; allowed: {error.allowed}", error.fix)]
+    else:
+        findings = diagnose(case)
     findings.sort(key=lambda finding: not finding.fix)
     for finding in findings:
         typer.echo(f"{'!!' if finding.fix else 'ok'} {finding}")
     if findings and findings[0].fix:
         raise typer.Exit(1)
-
-
-def _pixel(text: str) -> tuple[float, float]:
-    """Parse a value of ``--at``, (column, row) of a part's centre in pixels."""
-    return two_numbers("--at", text, "u,v in pixels", "412,230")
 
 
 def serve(
@@ -195,18 +175,15 @@ def serve(
 
     The page is reachable from this machine only and loads nothing from the network.
     """
-    from dopepp.core.errors import Interruption, interruptible, require
-
     # Gradio polls its own server, which httpx would log.
     logging.getLogger("httpx").setLevel(logging.WARNING)
-    with report_errors():
-        require("gradio", "dopepp serve", "web")
-        check_region(refine)
-        from dopepp.inference.page import serve_page
+    require("gradio", "dopepp serve", "web")
+    check_region(refine)
+    from dopepp.inference.page import serve_page
 
-        estimator = load_estimator(model, device, unit, working_distance, tilt)
-        estimator = estimator if refine is None else estimator.refining(refine)
-        estimator = estimator.reporting(conf)
-        with suppress(Interruption), interruptible(""), serve_page(estimator, port) as address:
-            typer.echo(f"{address} (press Ctrl-C to stop)")
-            Event().wait()
+    estimator = load_estimator(model, device, unit, working_distance, tilt)
+    estimator = estimator if refine is None else estimator.refining(refine)
+    estimator = estimator.reporting(conf)
+    with suppress(Interruption), interruptible(""), serve_page(estimator, port) as address:
+        typer.echo(f"{address} (press Ctrl-C to stop)")
+        Event().wait()

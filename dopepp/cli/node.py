@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 from typer import Argument, Option
@@ -23,22 +23,12 @@ from dopepp.cli.common import (
     WorkingDistance,
     check_region,
     load_estimator,
-    resumable,
 )
-from dopepp.core.errors import UserError, require
+from dopepp.core.errors import UserError, interruptible, require
 from dopepp.core.validation import Range, check
-from dopepp.robot.nodes.pairing import MAX_LAG_S
-
-if TYPE_CHECKING:
-    from dopepp.inference.estimator import PoseEstimator
-    from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
 LINES: Final = ("--json", "--udp")
-
 TOPIC: Final = "/camera/image_raw"
-
-PACKAGES: Final = {"--ros2": ("rclpy", "ros2"), "--bag": ("rosbags", "bags")}
-"""Package and extra that a transport needs."""
 
 
 def node(
@@ -92,7 +82,7 @@ def node(
     Exit codes: 0 done; 1 stopped (the camera stream ended); 2 wrong input; 130 or 143 interrupted.
     """
     words = list(source or ())
-    with resumable("the node has stopped"):
+    with interruptible("the node has stopped"):
         transports = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
         chosen = [option for option, is_given in transports.items() if is_given]
         transport = _check_transport(chosen, words, out, params)
@@ -100,7 +90,7 @@ def node(
         for_several: dict[str, object] = {"--views": views, "--world": world, "--lag": lag}
         for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
         _check_topics(topics, transport, for_one if len(topics) > 1 else for_several)
-        max_lag_s = check("--lag", MAX_LAG_S if lag is None else lag, float, Range(0, 10))
+        lag = None if lag is None else check("--lag", lag, float, Range(0, 10))
         check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
@@ -110,6 +100,8 @@ def node(
         fixed_camera = given_camera(K, camera)
 
         from dopepp.inference.frames import open_sources
+        from dopepp.inference.several_views.view_files import read_camera_poses
+        from dopepp.robot.nodes.views_worker import WORLD, ViewsWorker
         from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
         sources = open_sources(words, topics[0] if topic else None) if transport in LINES else []
@@ -120,14 +112,21 @@ def node(
         if track or refine or len(topics) > 1:
             estimator = estimator.refining("region")
         settings = WorkerSettings(conf, estimator.refiner is not None, overlay)
+        worker: Worker
         if len(topics) > 1:
-            worker = _views_worker(estimator, settings, topics, views, world, track)
+            poses, error = None, None
+            if views is not None:
+                file = read_camera_poses(views)
+                error = file.error
+                poses = [file.of(Path(topic.removesuffix("/compressed"))) for topic in topics]
+            worker = ViewsWorker(estimator, poses, world or WORLD, error, settings, track)
         else:
             worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":
+            from dopepp.robot.nodes.image_queue import MAX_LAG_S
             from dopepp.robot.nodes.ros2 import run
 
-            run(worker, topics, name, params, max_lag_s)
+            run(worker, topics, name, params, MAX_LAG_S if lag is None else lag)
             return
 
         from dopepp.robot.nodes.standalone import process_bag, send_lines
@@ -135,37 +134,17 @@ def node(
         if transport in LINES:
             send_lines(worker, zip(sources, cameras, strict=True), udp)
         elif bag is not None and out is not None:
-            poses = weaker = processed = skipped = 0
+            found = weaker = processed = skipped = 0
             for answer in process_bag(worker, bag, out, topics[0] if topic else None, name):
                 if answer is None:
                     skipped += 1
-                else:
-                    processed += 1
-                    poses += len(answer.result.detections)
-                    weaker += answer.result.num_weaker
+                    continue
+                processed += 1
+                found += len(answer.result.detections)
+                weaker += answer.result.num_weaker
             note = f", {skipped} skipped" if skipped else ""
             note += f"; {weaker} weaker candidates" if weaker else ""
-            typer.echo(f"{out}: {poses} poses in {processed} images{note}")
-
-
-def _views_worker(
-    estimator: PoseEstimator,
-    settings: WorkerSettings,
-    topics: Sequence[str],
-    views: Path | None,
-    world: str | None,
-    track: bool,
-) -> Worker:
-    """Return the worker for the images of several topics; see :func:`node` for the options."""
-    from dopepp.inference.several_views.view_files import read_camera_poses
-    from dopepp.robot.nodes.views_worker import WORLD, ViewsWorker
-
-    poses, error = None, None
-    if views is not None:
-        file = read_camera_poses(views)
-        error = file.error
-        poses = [file.of(Path(topic.removesuffix("/compressed"))) for topic in topics]
-    return ViewsWorker(estimator, poses, world or WORLD, error, settings, track)
+            typer.echo(f"{out}: {found} poses in {processed} images{note}")
 
 
 def _check_topics(topics: Sequence[str], transport: str, excluded: Mapping[str, object]) -> None:
@@ -191,20 +170,17 @@ def _check_transport(
         raise UserError(problem, allowed, "pass one of these options and leave out the others")
     transport = chosen[0]
     if transport in LINES and not words:
-        sources = "a camera, a video, images, …"
         fix = "write the source after the network, e.g. 0 for the first camera"
-        raise UserError(f"{transport} without a source", sources, fix)
+        raise UserError(f"{transport} without a source", "a camera, a video, images, …", fix)
     if transport not in LINES and words:
         allowed = "no source: the images come from --topic or from the recording"
-        problem, fix = f"{transport} with the source {words[0]}", f"leave out {words[0]}"
-        raise UserError(problem, allowed, fix)
+        raise UserError(f"{transport} with the source {words[0]}", allowed, f"leave out {words[0]}")
     if (transport == "--bag") != (out is not None):
         problem = "--out without --bag" if out else "--bag without --out"
         fix = "add --bag FILE" if out else "add --out poses.mcap"
         raise UserError(problem, "--bag together with --out", fix)
     if transport != "--ros2" and params:
         raise UserError(f"--params with {transport}", "--params with --ros2", "leave out --params")
-    if transport in PACKAGES:
-        package, extra = PACKAGES[transport]
-        require(package, transport, extra)
+    if transport == "--ros2":
+        require("rclpy", transport, "ros2")
     return transport

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import FileIO
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 from dopepp.core.errors import RunError, UserError, system_failure
 from dopepp.core.files import IMAGES, check_target, partial_path
@@ -24,49 +23,43 @@ if TYPE_CHECKING:
     from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.several_views.views_result import ViewsResult
 
-VIDEO: Final = ".mp4"
 
-Result = TypeVar("Result", contravariant=True)  # PoseResult, or ViewsResult
-
-
-class Output(Protocol[Result]):
+class Output(Protocol):
     """Writer of pose results to files, source by source."""
 
     def begin(self, source: FrameSource) -> None:
         """Prepare for the results of the next source, e.g. the frames of a video."""
 
-    def write(self, result: Result, /) -> None:
-        """Write the poses in an image of the current source."""
+    def write(self, result: Any, /) -> None:
+        """Write the poses in an image (PoseResult or ViewsResult) of the current source."""
 
     def close(self) -> None:
         """Finish and close the files; also called after an error, with the results so far."""
 
 
-class Outputs(Generic[Result]):
-    """Group of outputs for a ``with`` block, which closes them; an OSError becomes a RunError."""
+class Outputs:
+    """Group of (path, output) pairs for a ``with`` block; an OSError becomes a RunError."""
 
-    def __init__(self, outputs: Sequence[tuple[Path, Output[Result]]]) -> None:
+    def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs
 
     def begin(self, source: FrameSource) -> None:
         """Call :meth:`Output.begin` of each output."""
         self._each(lambda output: output.begin(source))
 
-    def write(self, result: Result) -> None:
+    def write(self, result: PoseResult | ViewsResult) -> None:
         """Call :meth:`Output.write` of each output."""
         self._each(lambda output: output.write(result))
 
-    def _each(self, action: Callable[[Output[Result]], None]) -> None:
+    def _each(self, action: Callable[[Output], None]) -> None:
         for path, output in self._outputs:
             with _disk_errors(path):
                 action(output)
 
-    def __enter__(self) -> Outputs[Result]:
+    def __enter__(self) -> Outputs:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with ExitStack() as stack:
             for path, output in self._outputs:
                 stack.enter_context(_disk_errors(path))
@@ -102,9 +95,8 @@ class OverlayFolder:
         if self._video is None:
             from dopepp.drawing.pictures import VideoFile
 
-            rate = (self._source.rate or 1.0) / self._stride
-            path = self._new_path(self._source.stem, VIDEO, Path(self._source.name))
-            self._video = VideoFile(path, rate)
+            path = self._new_path(self._source.stem, ".mp4", Path(self._source.name))
+            self._video = VideoFile(path, (self._source.rate or 1.0) / self._stride)
         self._video.write(result.plot(), result.time)
 
     def close(self) -> None:
@@ -141,11 +133,7 @@ class JsonLines:
         self._file = self._file or self._partial.open("wb", buffering=0)
 
     def write(self, result: PoseResult | ViewsResult) -> None:
-        """Append a line for the image.
-
-        Raises:
-            OSError: The disk is full; the incomplete line is removed.
-        """
+        """Append a line; on a full disk, remove the incomplete line and raise an OSError."""
         assert self._file is not None
         line, end = f"{result.to_json()}\n".encode(), self._file.tell()
         if self._file.write(line) < len(line):
@@ -168,9 +156,8 @@ class BopCsv:
 
     def __init__(self, path: Path) -> None:
         check_target(path, (".csv",))
-        self._path = path
+        self._path, self._scene = path, -1
         self._rows: list[BopResult] = []
-        self._scene = -1
 
     def begin(self, source: FrameSource) -> None:
         """Increase the scene number."""
@@ -184,9 +171,8 @@ class BopCsv:
         numbers = model_numbers(list(result.shapes))
         seconds = sum(result.speed.values()) / 1000
         for pose in result.detections:
-            number = numbers[pose.object]
-            row = BopResult(self._scene, result.number, number, pose.score, pose.T_cam_obj, seconds)
-            self._rows.append(row)
+            place = self._scene, result.number, numbers[pose.object]
+            self._rows.append(BopResult(*place, pose.score, pose.T_cam_obj, seconds))
 
     def close(self) -> None:
         """Write the file, if :meth:`begin` was called for any source."""

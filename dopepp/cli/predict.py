@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -30,18 +30,20 @@ from dopepp.cli.common import (
     Unit,
     WorkingDistance,
     load_estimator,
-    resumable,
 )
-from dopepp.core.errors import UserError
+from dopepp.core.errors import UserError, interruptible
 
 if TYPE_CHECKING:
-    from dopepp.cli.outputs import Output, Outputs
+    from dopepp.cli.outputs import Outputs
     from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.inference.frames import FrameSource
     from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.stream import StreamOptions
     from dopepp.parts.part import Part
+    from dopepp.recovery.detection import Detection
+
+    Verification = Callable[[PoseResult, Detection], float]
 
 
 def predict(
@@ -101,8 +103,8 @@ def predict(
     stopped (the camera stream ended, the disk is full); 2 wrong input; 130 or 143 interrupted.
     """
     gc.disable()  # all imported objects stay alive; collecting them would slow down the start
-    with resumable("the written files are complete"):
-        from dopepp.cli.outputs import Outputs
+    with interruptible("the written files are complete"):
+        from dopepp.cli.outputs import BopCsv, JsonLines, Outputs, OverlayFolder
         from dopepp.cli.predict_scene import predict_scene, track_scene
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
@@ -123,7 +125,13 @@ def predict(
             excluded |= {"--crop": crop, "--K-size": K_size, "--topic": topic}
             _exclude("--views", {**excluded, "--stride": stride != 1})
         terms = ("region",) if track or views else terms
-        outputs = _file_outputs(save, json_file, csv, stride)
+        outputs: list[tuple[Path, Any]] = []
+        if save is not None:
+            outputs.append((save, OverlayFolder(save, stride)))
+        if json_file is not None:
+            outputs.append((json_file, JsonLines(json_file)))
+        if csv is not None:
+            outputs.append((csv, BopCsv(csv)))
         words = [[word] for word in source] if track and views else [source]  # one for each camera
         sources = [opened for group in words for opened in open_sources(group, topic)]
         K = None if intrinsics is None else camera_matrix(*intrinsics)
@@ -144,14 +152,15 @@ def predict(
             lens = given_camera(K, camera)
             if track:
                 track_scene(estimator, sources, views, lens, save, json_file)
-                return
-            predict_scene(estimator, sources, views, lens, distance, save, json_file)
+            else:
+                predict_scene(estimator, sources, views, lens, distance, save, json_file)
             return
         if rerun is not None or show:
             from dopepp.inference.viewer import Viewer
 
             recordings = [rerun] * (rerun is not None) + [None] * show
             outputs += [(path or Path("viewer"), Viewer(estimator, path)) for path in recordings]
+        verification = _verification(known_parts) if verify else None
         options: StreamOptions = {
             "stride": stride,
             "track": track,
@@ -162,117 +171,85 @@ def predict(
             "depth": depth,
             "depth_scale": depth_scale,
         }
-        session = _Session(estimator, options, known_parts if verify else None)
         with Outputs(outputs) as written:
             for opened, its_camera in zip(sources, cameras, strict=True):
-                session.run(opened, its_camera, written)
+                written.begin(opened)
+                _predict_source(estimator, opened, its_camera, options, verification, written)
 
 
 def _exclude(option: str, others: dict[str, object]) -> None:
-    """Reject ``others`` (values by option name, false if not set), which ``option`` excludes.
-
-    Raises:
-        UserError: One of the other options is set.
-    """
+    """Reject ``others`` (values by option name, false if not set), which ``option`` excludes."""
     if given := ", ".join(name for name, value in others.items() if value):
         fix = f"leave out {option}, or {given}"
         raise UserError(f"{option} with {given}", f"{option} without these options", fix)
 
 
-def _file_outputs(
-    save: Path | None, json_file: Path | None, csv: Path | None, stride: int
-) -> list[tuple[Path, Output[PoseResult]]]:
-    """Return (path, output) pairs of the requested files; ``stride`` is the option's value."""
-    from dopepp.cli.outputs import BopCsv, JsonLines, OverlayFolder
+def _predict_source(
+    estimator: PoseEstimator,
+    source: FrameSource,
+    camera: Camera,
+    options: StreamOptions,
+    verification: Verification | None,
+    outputs: Outputs,
+) -> None:
+    """Print the poses in each image of a source, and pass them to the outputs."""
+    from dopepp.inference.pose_result import format_speed
 
-    requests: tuple[tuple[Path | None, Callable[[Path], Output[PoseResult]]], ...] = (
-        (save, lambda folder: OverlayFolder(folder, stride)),
-        (json_file, JsonLines),
-        (csv, BopCsv),
-    )
-    return [(path, make(path)) for path, make in requests if path is not None]
+    total = source.count and math.ceil(source.count / options["stride"])
+    results = estimator.stream(source, camera=camera, **options)
+    for number, result in enumerate(results, 1):
+        reason = ""
+        if not result.detections and source.rate is None and not options["track"]:
+            result, reason = _search_again(estimator, camera, options, result)
+        for record, detection in zip(result.records(), result.detections, strict=True):
+            if verification is not None:
+                record["agreement"] = verification(result, detection)
+            typer.echo(json.dumps(record, ensure_ascii=False))
+        summary = result.summary
+        if result.weaker:
+            shown_by = math.floor(1000 * min(result.weaker)) / 1000
+            summary += f" (--conf {shown_by:g} shows them)"
+        summary += f": {reason}" if reason else ""
+        progress = f"{number}/{total or '…'} {Path(result.name).name}: " if total != 1 else ""
+        typer.echo(f"{progress}{summary}; speed: {format_speed(result.speed)}", err=True)
+        outputs.write(result)
 
 
-def _floor(score: float) -> float:
-    return math.floor(1000 * score) / 1000
+def _verification(parts: Sequence[Part]) -> Verification:
+    """Return how well outline and creases of a detected part agree with the image, 0 to 1."""
+    from dopepp.virtual.agreement import agreement
+    from dopepp.virtual.surface import make_surface
+
+    surfaces = {part.name: make_surface(part.mesh) for part in parts if part.mesh}
+
+    def verify(result: PoseResult, detection: Detection) -> float:
+        surface = surfaces[detection.object]
+        return agreement(result.image, result.K, detection.T_cam_obj, surface)
+
+    return verify
 
 
-class _Session:
-    """Estimator of the poses in the images of sources, which it also prints.
+def _search_again(
+    estimator: PoseEstimator, camera: Camera, options: StreamOptions, result: PoseResult
+) -> tuple[PoseResult, str]:
+    """Search for parts at all distances in an image without detections.
 
-    Args:
-        estimator: Estimator of the poses in a single image.
-        options: Options of :func:`dopepp.inference.stream.stream` for all sources.
-        verified: Parts whose contours are compared with the image; None for no comparison.
+    Returns:
+        The new result, and why it has no detections (an empty string if it has any).
     """
+    if not estimator.has_network:
+        return result, "no pose at these distances passes the verification"
+    from dopepp.inference.frames.source import Lens
+    from dopepp.recovery.recover import format_reasons
 
-    def __init__(
-        self, estimator: PoseEstimator, options: StreamOptions, verified: Sequence[Part] | None
-    ) -> None:
-        self._estimator, self._options, self._verified = estimator, options, verified
-
-    def run(self, source: FrameSource, camera: Camera, outputs: Outputs[PoseResult]) -> None:
-        """Print the poses in each image of a source, and pass them to the outputs."""
-        from dopepp.inference.pose_result import format_speed
-
-        total = source.count and math.ceil(source.count / self._options["stride"])
-        outputs.begin(source)
-        results = self._estimator.stream(source, camera=camera, **self._options)
-        for number, result in enumerate(results, 1):
-            reason = ""
-            if not result.detections and source.rate is None and not self._options["track"]:
-                result, reason = self._search_again(result, camera)
-            for record in self._records(result):
-                typer.echo(json.dumps(record, ensure_ascii=False))
-            summary = result.summary
-            if result.weaker:
-                summary += f" (--conf {_floor(min(result.weaker)):g} shows them)"
-            summary += f": {reason}" if reason else ""
-            progress = f"{number}/{total or '…'} {Path(result.name).name}: " if total != 1 else ""
-            typer.echo(f"{progress}{summary}; speed: {format_speed(result.speed)}", err=True)
-            outputs.write(result)
-
-    def _search_again(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
-        """Search for parts at all distances in an image without detections.
-
-        Returns:
-            The new result, and why it has no detections (an empty string if it has any).
-        """
-        if not self._estimator.has_network:
-            return result, "no pose at these distances passes the verification"
-        from dopepp.inference.frames.source import Lens
-        from dopepp.recovery.recover import format_reasons
-
-        options, image, K = self._options, result.image, result.K
-        depth = options["depth"]
-        metres = (
-            None if depth is None else Lens(camera).read_depth(depth, options["depth_scale"], K)
-        )
-        region = (options["roi"], options["crop"] is not None)
-        if options["distances"] is None:
-            candidates = self._estimator.candidates(image, K, None, metres, "any", *region)
-            detections, weaker = self._estimator.split(candidates)
-            if detections:
-                text = "nothing detected at the trained sizes; searched at all sizes"
-                typer.echo(text, err=True)
-                return replace(result, detections=detections, weaker=weaker), ""
-        reason = self._estimator.explain(image, K, metres, options["distances"], *region)
-        return result, format_reasons(reason)
-
-    def _records(self, result: PoseResult) -> list[dict[str, object]]:
-        """Return a JSON object for each detection.
-
-        With ``--verify``, its ``agreement`` in [0, 1] states how well the part's outline and
-        creases agree with the image.
-        """
-        records = result.records()
-        if self._verified is None:
-            return records
-        from dopepp.virtual.agreement import agreement
-        from dopepp.virtual.surface import make_surface
-
-        meshes = {part.name: make_surface(part.mesh) for part in self._verified if part.mesh}
-        for record, detection in zip(records, result.detections, strict=True):
-            surface = meshes[detection.object]
-            record["agreement"] = agreement(result.image, result.K, detection.T_cam_obj, surface)
-        return records
+    image, K, depth = result.image, result.K, options["depth"]
+    metres = None if depth is None else Lens(camera).read_depth(depth, options["depth_scale"], K)
+    region = options["roi"], options["crop"] is not None
+    if options["distances"] is None:
+        candidates = estimator.candidates(image, K, None, metres, "any", *region)
+        detections, weaker = estimator.split(candidates)
+        if detections:
+            typer.echo("nothing detected at the trained sizes; searched at all sizes", err=True)
+            return replace(result, detections=detections, weaker=weaker), ""
+    reason = estimator.explain(image, K, metres, options["distances"], *region)
+    return result, format_reasons(reason)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dopepp.inference.frames import CameraFrame, FrameSource
     from dopepp.inference.network_input import Distances
     from dopepp.inference.several_views.view_files import CameraPoses
+    from dopepp.inference.several_views.views_result import ViewsResult
 
 
 def predict_scene(
@@ -41,8 +42,8 @@ def predict_scene(
         views: File of the camera poses.
         camera: Intrinsics of the images for which ``views`` names no camera file.
         distances: Nearest and farthest depth of the parts, metres, or ``any``.
-        save: Folder for images with drawn poses; None writes none.
-        json_file: File for a line of JSON; None writes none.
+        save: Folder for images with drawn poses.
+        json_file: File for a line of JSON.
 
     Raises:
         UserError: There are fewer than two images, a source is not a still image, or an image
@@ -53,20 +54,16 @@ def predict_scene(
 
     poses = read_camera_poses(views)
     frames = [frame for source in sources for frame in source.frames()]
-    if len(frames) < 2 or any(source.rate is not None for source in sources):
-        problem = f"--views with {len(frames)} image{'s' * (len(frames) != 1)}"
-        if any(source.rate is not None for source in sources):
-            problem = "--views with a video, a recording or a camera"
+    is_video = any(source.rate is not None for source in sources)
+    if len(frames) < 2 or is_video:
+        images = f"{len(frames)} image{'s' * (len(frames) != 1)}"
+        problem = f"--views with {'a video, a recording or a camera' if is_video else images}"
         raise UserError(problem, "two images or more", "pass the images of one static scene")
     given = _posed(frames, poses, camera)
     result = estimator.predict_views(
         *given[:3], distances=distances, camera_error=poses.error, names=given.names
     )
-    for record in result.records():
-        typer.echo(json.dumps(record, ensure_ascii=False))
-    for finding in result.findings:
-        typer.echo(finding, err=True)
-    typer.echo(result.summary, err=True)
+    _show(result)
     if save is not None:
         result.save(save)
     if json_file is not None:
@@ -83,13 +80,7 @@ def track_scene(
 ) -> None:
     """Track the parts through synchronised sources; print and write the poses of each set.
 
-    Args:
-        estimator: Estimator that refines by region.
-        sources: Images or video of each camera. The n-th frames of all sources are a set.
-        views: File of the camera poses.
-        camera: Intrinsics of the images for which ``views`` names no camera file.
-        save: Folder for images or videos with drawn poses; None writes none.
-        json_file: File for a line of JSON for each set; None writes none.
+    The arguments are those of :func:`predict_scene`. The n-th frames of all sources are a set.
 
     Raises:
         UserError: There are fewer than two sources, a source is a camera, the numbers of frames
@@ -113,25 +104,29 @@ def track_scene(
     with ExitStack() as files:
         written, drawn = files.enter_context(Outputs(lines)), []
         written.begin(sources[0])
-        if save is not None:
-            for number, source in enumerate(sources):
-                stem = source.stem if source.rate else Path(source.name).absolute().parent.name
-                folder = save / f"{number}_{stem}"
-                drawn.append(files.enter_context(Outputs([(folder, OverlayFolder(folder))])))
-                drawn[-1].begin(source)
+        for number, source in enumerate(sources if save is not None else ()):
+            assert save is not None
+            stem = source.stem if source.rate else Path(source.name).absolute().parent.name
+            folder = save / f"{number}_{stem}"
+            drawn.append(files.enter_context(Outputs([(folder, OverlayFolder(folder))])))
+            drawn[-1].begin(source)
         for number, frames in enumerate(zip_longest(*(source.frames() for source in sources))):
             if None in frames:  # a video whose header states more frames
                 raise differ
             given = _posed(frames, poses, camera)
             result = tracker.track(*given[:3], camera_error=poses.error, names=given.names)
-            for record in result.records():
-                typer.echo(json.dumps({"number": number, **record}, ensure_ascii=False))
-            for finding in result.findings:
-                typer.echo(finding, err=True)
-            typer.echo(f"{number + 1}/{counts[0]}: {result.summary}", err=True)
+            _show(result, {"number": number}, f"{number + 1}/{counts[0]}: ")
             written.write(result)
             for output, view, frame in zip(drawn, result.views, frames, strict=False):
                 output.write(replace(view, number=frame.number, time=frame.time))
+
+
+def _show(result: ViewsResult, shared: dict[str, object] | None = None, progress: str = "") -> None:
+    """Print a line of JSON (with ``shared``) for each part, and findings and summary on stderr."""
+    for record in result.records():
+        typer.echo(json.dumps({**(shared or {}), **record}, ensure_ascii=False))
+    for line in (*result.findings, f"{progress}{result.summary}"):
+        typer.echo(line, err=True)
 
 
 class _PosedFrames(NamedTuple):
@@ -146,11 +141,7 @@ class _PosedFrames(NamedTuple):
 def _posed(
     frames: Sequence[CameraFrame], poses: CameraPoses, camera: Camera | None
 ) -> _PosedFrames:
-    """Return frames with their cameras; ``camera`` is used where the file names none.
-
-    Raises:
-        UserError: A frame has no pose or no camera.
-    """
+    """Return frames with their cameras; ``camera`` is used where the file names none."""
     paths = [Path(frame.name) for frame in frames]
     names = [path.name for path in paths]
     if len(set(names)) < len(names):  # images of one moment, in a folder for each camera

@@ -16,17 +16,12 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import Step, Transform, move_pose, step_between
 
+# Standard deviations of the change in velocity per frame, radians about each axis and metres per
+# metre of distance: of a part at rest (smaller values reduce jitter), and of a part that a hand
+# moves by up to 8° and 5 % of the distance per frame (two standard deviations).
 STILL: Final = (math.radians(0.05), 2e-4)
-"""Standard deviations of the change in velocity of a part at rest, per frame: radians about each
-axis, and metres per metre of distance. Smaller values reduce jitter."""
-
 SUDDEN: Final = (math.radians(4.0), 0.025)
-"""Like :data:`STILL`, for a part that a hand moves by up to 8° and 5 % of the distance per frame
-(two standard deviations)."""
-
-SWERVE: Final = 0.6
-"""Factor on speed plus last correction: further standard deviation of the change in velocity."""
-
+SWERVE: Final = 0.6  # further standard deviation of this change, share of speed + last correction
 PERSISTENCE: Final = 0.95  # share of the velocity that remains after a frame
 
 
@@ -47,23 +42,16 @@ class Motion:
         return self.covariance[:6, :6]
 
     def predict(self, distance: float, sudden: bool = False) -> Motion:
-        """Predict the motion on the next frame.
+        """Predict the motion on the next frame of a part at a distance (metres) from the camera.
 
-        Args:
-            distance: Distance of the part from the nearest camera, metres.
-            sudden: Whether to permit a large change in velocity.
+        ``sudden`` permits a large change in velocity.
         """
         step = np.eye(12)
         step[:6, 6:] = step[6:, 6:] = PERSISTENCE * np.eye(6)
-        added = np.kron(
-            [[1.0, 1.0], [1.0, 1.0]], np.diag(self._velocity_change(distance, sudden) ** 2)
-        )
-        return Motion(
-            move_pose(self.T_cam_obj, PERSISTENCE * self.velocity),
-            PERSISTENCE * self.velocity,
-            step @ self.covariance @ step.T + added,
-            self.correction,
-        )
+        change = self._velocity_change(distance, sudden)
+        covariance = step @ self.covariance @ step.T + np.kron(np.ones((2, 2)), np.diag(change**2))
+        velocity = PERSISTENCE * self.velocity
+        return Motion(move_pose(self.T_cam_obj, velocity), velocity, covariance, self.correction)
 
     def update(self, T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"]) -> Motion:
         """Update a prediction by a pose whose covariance already contains the prediction."""

@@ -41,9 +41,7 @@ HOST: Final = "127.0.0.1"  # reachable from this machine only
 MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels
 SHOWN_PX: Final = 1600  # longest side of the drawn image, pixels
 
-VIEW, NUMBERS, FILE = "field of view", "K", "camera file"
-"""Ways to specify the camera."""
-
+VIEW, NUMBERS, FILE = "field of view", "K", "camera file"  # ways to specify the camera
 COLUMNS: Final = ["part", "score", "x mm", "y mm", "z mm", "qw", "qx", "qy", "qz", "error px"]
 """Table: position and quaternion in the camera frame, and the reprojection error."""
 
@@ -81,9 +79,7 @@ Outputs = tuple[RGBImage | None, str, list[list[object]], Any, RGBImage | None]
 def serve_page(estimator: PoseEstimator, port: int | None = None) -> Iterator[str]:
     """Serve the page in another thread while the block runs; yield its address.
 
-    Args:
-        estimator: Estimates the poses.
-        port: Port (default: the first free port from 7860 on).
+    The default port is the first free port from 7860 on.
 
     Raises:
         UserError: Another program uses the port.
@@ -141,15 +137,8 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
 
 def _image(label: str, name: str, is_visible: bool = True) -> gr.Image:
     """Return an image output without Gradio's button that publishes the image."""
-    buttons: Any = ["download", "fullscreen"]
-    return gr.Image(
-        label=label,
-        elem_id=name,
-        interactive=False,
-        format="png",
-        buttons=buttons,
-        visible=is_visible,
-    )
+    shared: dict[str, Any] = {"format": "png", "buttons": ["download", "fullscreen"]}
+    return gr.Image(label=label, elem_id=name, interactive=False, visible=is_visible, **shared)
 
 
 def _camera_inputs() -> list[Any]:
@@ -186,16 +175,8 @@ def _outputs(
     if not detections and estimator.has_network:
         remark = f": {format_reasons(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
-    result = PoseResult(
-        image,
-        K,
-        detections,
-        {},
-        path.name,
-        shapes=shapes,
-        weaker=weaker,
-        min_score=estimator.min_score,
-    )
+    shared: dict[str, Any] = {"shapes": shapes, "weaker": weaker, "min_score": estimator.min_score}
+    result = PoseResult(image, K, detections, {}, path.name, **shared)
     file = Path(mkdtemp(dir=folder), f"{path.stem}.json")
     write_file(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())
     rows: list[list[object]] = []
@@ -207,9 +188,8 @@ def _outputs(
     drawn = result.plot()
     scale = SHOWN_PX / max(drawn.shape)
     if scale < 1:
-        drawn = np.asarray(
-            cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        )
+        area = cv2.INTER_AREA
+        drawn = np.asarray(cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=area))
     summary = _message(f"{result.summary}{remark}", is_error=not detections)
     maps = belief_sheet(estimator, image, K) if estimator.has_network else None
     return drawn, summary, rows, _button(file), maps

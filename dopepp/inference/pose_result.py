@@ -48,13 +48,11 @@ from dopepp.recovery.detection import Detection
 if TYPE_CHECKING:
     import pandas as pd
 
+# Undistorting and resizing, network, poses from maps or templates, refinement.
 STEPS: Final = ("pre", "network", "decode", "refine")
-"""Steps of a prediction: undistorting and resizing, network, poses from maps or templates,
-refinement."""
+FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"  # frame of T_cam_obj
 
-FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"
-"""Frame of all poses: ``T_cam_obj`` maps from the mesh's frame to this frame."""
-
+# Colours of the instances on an image, in turn.
 COLOURS: Final[tuple[Colour, ...]] = (
     YELLOW,
     (255, 120, 200),
@@ -63,14 +61,11 @@ COLOURS: Final[tuple[Colour, ...]] = (
     (170, 140, 255),
     (170, 230, 80),
 )
-"""Colours of the instances on an image, in turn."""
-
 AXES: Final[tuple[Colour, ...]] = ((240, 50, 50), (50, 200, 50), (70, 110, 255))
 """Colours of the object's x, y and z axis."""
 
 AXIS: Final = 0.35  # length of a drawn axis, diameters
 LINE: Final = 1 / 640  # width of a line, share of the image width
-
 FINEST: Final = 1 / 60
 """Largest width of a line, share of the instance's extent: lines do not hide a small part."""
 
@@ -142,11 +137,7 @@ class PoseResult:
         return canvas
 
     def save(self, path: Path | str) -> None:
-        """Write :meth:`plot` as PNG or JPEG, according to the suffix.
-
-        Raises:
-            UserError: The suffix is neither PNG's nor JPEG's, or the file cannot be written.
-        """
+        """Write :meth:`plot` as PNG or JPEG, according to the suffix, or raise a ``UserError``."""
         check_target(Path(path), IMAGES)
         write_image(Path(path), self.plot())
 

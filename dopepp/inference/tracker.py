@@ -25,13 +25,7 @@ from jaxtyping import Float
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import (
-    CameraMatrix,
-    Step,
-    Transform,
-    project_keypoints,
-    transform,
-)
+from dopepp.geometry.camera import CameraMatrix, Step, Transform, project_keypoints, transform
 from dopepp.inference.motion import Motion, at_rest
 from dopepp.inference.network_input import Region, prepare_image
 from dopepp.recovery.detection import Detection
@@ -39,32 +33,20 @@ from dopepp.recovery.detection import Detection
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
 
-AROUND: Final = 0.5
-"""Margin of the region in which the network searches a doubtful part, share of its extent."""
-
-NEAR: Final = 0.5
-"""Largest distance between the centres of a track and a detection of the same part, diameters."""
-
-ELSEWHERE: Final = 0.1
-"""Mean distance between keypoints above which track and detection disagree, diameters."""
-
+AROUND: Final = 0.5  # margin around a doubtful part in which it is searched, share of its extent
+NEAR: Final = 0.5  # largest distance between the centres of a track and its detection, diameters
+ELSEWHERE: Final = 0.1  # mean keypoint distance above which track and detection disagree, diameters
 OUTVOTED: Final = 2  # consecutive disagreeing detections after which a track moves to them
-
+# Share of the usual agreement below which a track is doubtful. On rendered sequences, the share was
+# 0.97 at correct poses, and 0.5 at poses that an occluder had displaced.
 DOUBTFUL: Final = 0.8
-"""Share of the usual agreement below which a track is doubtful. On rendered sequences, the share
-was 0.97 at correct poses, and 0.5 at poses that an occluder had displaced."""
-
+# Agreement below which a pose is rejected (unless the first pose agreed less): half of a wrong
+# pose's outline may coincide with other edges.
 TRUSTED: Final = 0.6
-"""Agreement below which a pose is rejected (unless the first pose agreed less): half of a wrong
-pose's outline may coincide with other edges."""
-
 SURE: Final = 0.85  # agreement below which the network is run every OFTEN frames
 OFTEN: Final = 5
 USUAL: Final = 0.1  # weight of a frame in the usual agreement
-
-PATIENCE: Final = 6
-"""Number of consecutive doubtful frames in which a part continues its motion before it is lost."""
-
+PATIENCE: Final = 6  # consecutive doubtful frames in which a part moves on before it is lost
 FORGOTTEN: Final = 300  # frames after which a lost part is no longer searched
 
 Item = TypeVar("Item")  # type of a detection: in a camera, or in the world
@@ -88,9 +70,7 @@ class Track(Generic[Item]):
 
     identity: int  # number of the instance, kept while the part is tracked or lost
     detection: Item  # this frame's pose, with score and peaks of the network's last run
-    # Motion per frame in the axes of the pose's frame: rotation vector about the object's origin
-    # (radians), and shift (metres)
-    velocity: Step
+    velocity: Step  # per frame, as in :class:`.Motion`
     detected: bool  # whether this frame's pose came from the network's detection
 
 
@@ -125,10 +105,8 @@ class _State(Generic[Item]):
 class Tracker(ABC, Generic[Item]):
     """Tracks the parts of an estimator from frame to frame; subclasses refine and detect.
 
-    Args:
-        estimator: Estimator that refines poses on the image (``refine="region"``).
-        detect_every: The network is run on every n-th frame even if all parts are tracked, to
-            detect parts that have come into view.
+    The network is run on every ``detect_every``-th frame even if all parts are tracked, to detect
+    parts that have come into view.
 
     Raises:
         UserError: The estimator does not refine, or ``detect_every`` is below 1.
@@ -156,7 +134,7 @@ class Tracker(ABC, Generic[Item]):
 
     @abstractmethod
     def _refined(self, estimate: Estimate[Item], forecast: Motion) -> Estimate[Item] | None:
-        """Refine a predicted pose of a part on the frame; return None if the frame has no part."""
+        """Refine a predicted pose of a part on the frame; return None if the part is not there."""
 
     @abstractmethod
     def _moved(
@@ -250,11 +228,7 @@ class Tracker(ABC, Generic[Item]):
                 detected = np.reshape([item.pose[:3, 3] for item in left], (1, -1, 3))
                 distances = np.linalg.norm(tracked - detected, axis=2)
                 assigned = scipy.optimize.linear_sum_assignment(distances)
-                near = [
-                    (row, column)
-                    for row, column in zip(*assigned, strict=True)
-                    if distances[row, column] <= limit
-                ]
+                near = [pair for pair in zip(*assigned, strict=True) if distances[pair] <= limit]
                 pairs += [(chosen[row], left[column]) for row, column in near]
                 used = {column for _, column in near}
                 left = [detection for number, detection in enumerate(left) if number not in used]
@@ -275,12 +249,7 @@ class PoseTracker(Tracker[Detection]):
     def track(
         self, image: RGBImage, K: CameraMatrix, cropped: bool = False
     ) -> list[Track[Detection]]:
-        """Track and detect the parts on the next frame.
-
-        Args:
-            image: RGB, uint8, without lens distortion.
-            K: Camera matrix, pixels.
-            cropped: As in :meth:`PoseEstimator.predict`.
+        """Track and detect the parts on the next frame; for arguments, see `PoseEstimator.predict`.
 
         Returns:
             Parts that are not lost and have at least the estimator's minimum score, by identity.
@@ -297,18 +266,16 @@ class PoseTracker(Tracker[Detection]):
     def _refined(
         self, estimate: Estimate[Detection], forecast: Motion
     ) -> Estimate[Detection] | None:
-        pose, covariance = forecast.T_cam_obj, forecast.pose_covariance
-        start = replace(estimate.detection, T_cam_obj=pose, covariance=covariance)
+        start = _forecast(estimate, forecast)
         refined = self.estimator.refined([start], self._image, self._K)[0]
         return None if refined.kept else _estimate(refined)
 
     def _moved(
         self, estimate: Estimate[Detection], forecast: Motion, agreement: float
     ) -> Estimate[Detection]:
-        pose, covariance = forecast.T_cam_obj, forecast.pose_covariance
-        keypoints = project_keypoints(self._cuboid_of[estimate.object], pose, self._K)
-        start = replace(estimate.detection, T_cam_obj=pose, covariance=covariance)
-        return _estimate(replace(start, keypoints=keypoints, agreement=agreement))
+        moved = _forecast(estimate, forecast)
+        keypoints = project_keypoints(self._cuboid_of[estimate.object], moved.T_cam_obj, self._K)
+        return _estimate(replace(moved, keypoints=keypoints, agreement=agreement))
 
     def _detected(self, near: Sequence[Estimate[Detection]] | None) -> list[Estimate[Detection]]:
         roi = None
@@ -317,6 +284,12 @@ class PoseTracker(Tracker[Detection]):
         candidates = self.estimator.candidates(self._image, self._K, roi=roi, cropped=True)
         detections, self.weaker = self.estimator.split(candidates)
         return [_estimate(detection) for detection in detections if not detection.kept]
+
+
+def _forecast(estimate: Estimate[Detection], forecast: Motion) -> Detection:
+    """Return a part's detection at its predicted pose."""
+    pose, covariance = forecast.T_cam_obj, forecast.pose_covariance
+    return replace(estimate.detection, T_cam_obj=pose, covariance=covariance)
 
 
 def _estimate(detection: Detection) -> Estimate[Detection]:

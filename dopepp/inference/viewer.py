@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 import cv2
@@ -38,20 +37,13 @@ GROUPS: Final = ("parts", "meshes", "uncertainty")
 CENTRE: Final = 0.5  # coordinate of the top-left pixel's centre in Rerun
 LOCALHOST: Final = "127.0.0.1"
 START_S: Final = 20.0  # timeout for opening a window, seconds
-
-ELLIPSOID: Final = 2.8
-"""Half axes of the ellipsoid, standard deviations: 95 % of a normal distribution in space."""
-
+ELLIPSOID: Final = 2.8  # half axes, standard deviations: 95 % of a normal distribution in space
 JPEG_QUALITY: Final = 90
 SINCE_1970: Final = 1e8  # seconds above which a time counts from 1970, not from a video's start
 
 
 class Viewer:
-    """A Rerun recording, shown in a window or written to a file.
-
-    Args:
-        estimator: Estimator that computed the results, for the parts and belief maps.
-        path: ``.rrd`` file; None opens a window.
+    """A Rerun recording of an estimator's results, written to an ``.rrd`` file or (None) shown.
 
     Raises:
         UserError: The extra ``rerun`` is not installed, the file cannot be written, or there is no
@@ -118,14 +110,6 @@ class Viewer:
         if self._path is not None and (partial := partial_path(self._path)).exists():
             partial.replace(self._path)
         self._is_open = False
-
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _distance(self, result: PoseResult) -> float:
         """Return the depth of the farthest part, or of a part that fills the image, metres."""
@@ -226,10 +210,7 @@ def _is_listening(port: int) -> bool:
 
 
 def _blueprint(distance: float) -> Any:
-    """Return the layout: a 3D view on the left; image, belief maps and summary on the right.
-
-    ``distance`` is the depth of the parts in the camera frame, metres.
-    """
+    """Return the layout: a 3D view on the left; image, belief maps and summary on the right."""
     import rerun.blueprint as rrb
 
     eye = rrb.EyeControls3D(

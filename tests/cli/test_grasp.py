@@ -101,7 +101,9 @@ def test_a_part_without_a_grasp_or_a_network_is_rejected(refused, tmp_path):
     trimesh.creation.box((60, 30, 20)).export(tmp_path / "block.stl")
     words = ["--part", tmp_path / "block.stl", "--unit", "mm", "--out", tmp_path]
     assert "without a network" in refused("grasp", *words)
-    assert "part block without a grasp" in refused("grasp", *words, "--poses", "exact")
+    line = refused("grasp", *words, "--poses", "exact")
+    assert "part block without a grasp" in line
+    assert "dopepp grasp propose block" in line
 
 
 def test_grasps_out_of_reach_are_an_error(run, tmp_path):

@@ -26,10 +26,11 @@ def result(piv_estimator, piv_render):
 
 def test_recording_contains_every_entity(estimator, result, tmp_path):
     path = tmp_path / "new" / "out.rrd"
-    with Viewer(estimator, path) as viewer:
-        viewer.write(result)
-        viewer.write(PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4))
-        assert not path.exists()
+    viewer = Viewer(estimator, path)
+    viewer.write(result)
+    viewer.write(PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4))
+    assert not path.exists()
+    viewer.close()
     assert [file.name for file in path.parent.iterdir()] == ["out.rrd"]
     chunks = rerun.chunk.RrdReader(path).stream().to_chunks()
     logged = {chunk.entity_path for chunk in chunks}

@@ -12,7 +12,6 @@ To add a check, write a function from a :class:`Case` to a :class:`Diagnosis` an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -35,19 +34,17 @@ from dopepp.parts.size import is_plausible, size_in_words
 __all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
 
 SAME: Final = 1.05  # ratio of two sizes of a part that simplification of its mesh may cause
-
+# Grey level (0 to 255) of highlights below which an image is dark: above 105 in good renders, 35 to
+# 60 at 1/16 of the light.
 DARK: Final = 70.0
-"""Grey level (0 to 255) of highlights below which an image is dark: above 105 in good renders, 35
-to 60 at 1/16 of the light."""
 
+# Shares of white pixels above which the image, or the region of the part, is overexposed: up to 0.1
+# in good renders, 0.2 to 0.8 with eight times the light.
 CLIPPED, CLIPPED_PART = 0.25, 0.15
-"""Shares of white pixels above which the image, or the region of the part, is overexposed: up to
-0.1 in good renders, 0.2 to 0.8 with eight times the light."""
 
+# Width of edges above which an image is blurred, pixels of the network's input. A blur of two
+# pixels (1.1 to 2) is harmless. At a blur of five (3.2 to 4.7), a quarter of the parts is missed.
 BLURRED: Final = 2.5
-"""Width of edges above which an image is blurred, pixels of the network's input. A blur of two
-pixels measures 1.1 to 2 and is harmless. A blur of five pixels measures 3.2 to 4.7, and a quarter
-of the parts is missed."""
 
 # K is reported as wrong if a focal length that differs by the factor FOCAL reduces the keypoint
 # error by the factor GAIN, and the standard deviation of its logarithm is below CERTAIN. The error
@@ -55,24 +52,17 @@ of the parts is missed."""
 # 2, the error is reduced by a factor of 3 to 20 on a third of the images.
 FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 
+# Belief at a part's centre from which the part is partly visible: 0.4 to 0.8 for half-occluded
+# parts, mostly below 0.2 on images without the part.
 PARTLY: Final = 0.3
-"""Belief at a part's centre from which the part is partly visible: 0.4 to 0.8 for half-occluded
-parts, mostly below 0.2 on images without the part."""
-
-MIN_SCORE: Final = 0.03
-"""Smallest score of a correct detection; false positives of an untuned network score lower."""
-
-OFF: Final = 0.08
-"""Reprojection error above which a pose is reported, share of the part's length on the image: up to
-0.06 for good poses."""
-
+MIN_SCORE: Final = 0.03  # of a correct detection; untuned networks' false positives score lower
+OFF: Final = 0.08  # largest reprojection error, share of the part's length: up to 0.06 if good
 AGREEING: Final = 0.6  # smallest share of the outline that agrees: 0.68 to 1 in good renders
 
 ABSENT: Final = (
     "check that the part is on the image, uncovered, and shows a side that training images showed; "
     "otherwise train with its materials, light and backgrounds"
 )
-
 TUNE: Final = (
     "tune with images that do not show the part: python evaluate.py ckpt_path=MODEL tune=true "
     "virtual.negative_photos=FOLDER"
@@ -252,22 +242,9 @@ def pose(case: Case) -> Diagnosis:
     return Diagnosis("pose", sentence, "" if refined.agreement >= AGREEING else fix)
 
 
-Check = Callable[[Case], Diagnosis]
-
-CHECKS: Final[Sequence[Check]] = (
-    part_size,
-    exposure,
-    sharpness,
-    camera,
-    size,
-    visibility,
-    elsewhere,
-    pose,
-)
-"""Checks; faults that a check finds may also explain the failures of later checks."""
-
-EMPTY_CHECKS: Final[Sequence[Check]] = (part_size, elsewhere)
-"""Checks of an image that shows none of the parts, so that every detection is a false positive."""
+# Faults that a check finds may also explain the failures of later checks.
+CHECKS: Final = (part_size, exposure, sharpness, camera, size, visibility, elsewhere, pose)
+EMPTY_CHECKS: Final = (part_size, elsewhere)  # of an image without parts: detections are false
 
 
 def diagnose(case: Case) -> list[Diagnosis]:
@@ -279,8 +256,8 @@ def diagnose(case: Case) -> list[Diagnosis]:
 def _lens_ratio(case: Case) -> float | None:
     """Return the ratio of K's and training's focal lengths if it explains a wrong distance.
 
-    Otherwise return None: the part's distance lies within the training range, its size on the image
-    does not, or the focal lengths hardly differ.
+    It does not if the part's distance lies within the training range, its size on the image does
+    not, or the focal lengths hardly differ.
     """
     if case.seen is None or case.distances is not None or case.detection is None:
         return None

@@ -21,15 +21,12 @@ from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import Detection
 
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
-
 BELIEVED: Final = (0.4, 6)
 """Smallest mean belief and number of keypoints of a detection outside the expected distances."""
 
 MIN_PX: Final = 24  # smallest side of an image whose sharpness can be measured
-
 NARROWEST: Final = 0.5  # pixels: narrower edges cannot be distinguished
 FEWEST: Final = 8  # smallest number of edge pixels for a measurement of sharpness
-
 STRONG: Final = 0.3
 """Share of the strongest gradient above which an edge is measured: weaker edges are shading, noise
 or out-of-focus background."""
@@ -43,12 +40,11 @@ class Case:
     Args:
         estimator: Estimator to diagnose.
         image: RGB, without distortion.
-        K: Camera matrix, pixels.
+        K: Camera matrix.
         parts: The estimator's parts, with meshes where available.
         distances: Nearest and farthest depth, metres (default: the training range).
         cropped: As in :meth:`PoseEstimator.predict`.
-        centres: Pixel of each shown part's centre; empty if the image shows none of the parts, None
-            if unknown.
+        centres: Pixel of each shown part's centre; None if it is unknown which parts are shown.
     """
 
     def __init__(

@@ -33,9 +33,7 @@ an opened frame source."""
 def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> list[FrameSource]:
     """Open frame sources in the given order. Consecutive image files form one sequence.
 
-    Args:
-        sources: Paths, glob patterns, camera numbers, URLs and opened frame sources.
-        topic: Image topic of a ROS recording that has several.
+    ``topic`` is the image topic of a ROS recording that has several.
 
     Raises:
         UserError: A file, camera or topic does not exist, a folder has no images, a video or
@@ -72,22 +70,14 @@ def _resolve(sources: Iterable[SourceLike]) -> Iterator[SourceLike]:
             yield Path(source)
         elif str(source).isdecimal() and len(str(source)) < 4:
             yield int(str(source))
+        elif paths := glob.glob(str(source), recursive=True):  # noqa: PTH207
+            yield from sort_paths(map(Path, paths))
         else:
-            yield from _expand(str(source))
-
-
-def _expand(pattern: str) -> list[Path]:
-    """Return the paths that match a glob pattern, in natural order.
-
-    Raises:
-        UserError: No file matches.
-    """
-    if paths := glob.glob(pattern, recursive=True):  # noqa: PTH207
-        return sort_paths(map(Path, paths))
-    problem = "which matches no file" if glob.has_magic(pattern) else "no such file"
-    raise UserError(
-        f"{pattern}, {problem}",
-        f"an image, a folder of images, a pattern like 'frames/*.png', a video or a recording "
-        f"({', '.join((*VIDEOS, *BAGS))}), a camera number, or an rtsp:// or http:// address",
-        "pass the path of an existing file, in quotes if it is a pattern",
-    )
+            problem = "which matches no file" if glob.has_magic(str(source)) else "no such file"
+            raise UserError(
+                f"{source}, {problem}",
+                "an image, a folder of images, a pattern like 'frames/*.png', a video or a "
+                f"recording ({', '.join((*VIDEOS, *BAGS))}), a camera number, or an rtsp:// or "
+                "http:// address",
+                "pass the path of an existing file, in quotes if it is a pattern",
+            )

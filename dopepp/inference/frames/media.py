@@ -13,7 +13,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -27,12 +27,10 @@ from dopepp.drawing.pictures import MAX_PIXELS, USUAL_RATE, RGBImage, read_photo
 from dopepp.inference.frames.ros import BAGS, is_bag_folder
 from dopepp.inference.frames.source import CameraFrame, FrameSource
 
+# Suffixes of image files in a folder; a file whose path is given may have any suffix.
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-"""Suffixes of image files in a folder; a file whose path is given may have any suffix."""
-
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts")
-
-HIGHEST_RATE: Final = 1000.0
+HIGHEST_RATE: Final = 1000.0  # frames per second
 
 # FFmpeg also opens playlists, which refer to other files, so the container is checked first.
 _VIDEO_HEADER: Final = re.compile(
@@ -40,7 +38,6 @@ _VIDEO_HEADER: Final = re.compile(
 )
 
 SCHEMES: Final = ("rtsp", "rtsps", "http", "https")
-
 FIRST_S: Final = 15.0  # timeout of the first frame: a stream starts at the next key frame
 STALLED_S: Final = 5.0  # seconds without a frame after which a camera counts as disconnected
 _RETRY_S: Final = 0.02  # seconds between two reads of a camera that has no frame
@@ -59,11 +56,7 @@ class Images(FrameSource):
         self._numbers = numbers if are_unique else range(len(paths))
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th image.
-
-        Raises:
-            UserError: An image is damaged.
-        """
+        """Yield every ``stride``-th image; raise a ``UserError`` if an image is damaged."""
         for number, path in list(zip(self._numbers, self._paths, strict=True))[::stride]:
             yield CameraFrame(read_photo(path), str(path), number)
 
@@ -105,7 +98,14 @@ class Video(FrameSource):
 
     def __init__(self, path: Path) -> None:
         self._path, self.name, self.stem = path, str(path), path.stem
-        _check_container(path)
+        try:
+            with path.open("rb") as file:
+                header = file.read(16)
+        except OSError as error:
+            raise _unreadable(path, error.strerror or str(error)) from error
+        if not _VIDEO_HEADER.match(header):
+            reason = "it does not begin like a video" if header else "an empty file"
+            raise _unreadable(path, reason)
         with self._opened() as capture:
             width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
             height = capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -147,17 +147,6 @@ class Video(FrameSource):
             capture.release()
 
 
-def _check_container(path: Path) -> None:
-    """Check by its first bytes that a file is a video."""
-    try:
-        with path.open("rb") as file:
-            header = file.read(16)
-    except OSError as error:
-        raise _unreadable(path, error.strerror or str(error)) from error
-    if not _VIDEO_HEADER.match(header):
-        raise _unreadable(path, "it does not begin like a video" if header else "an empty file")
-
-
 def _unreadable(path: Path, reason: str) -> UserError:
     allowed = f"a video that FFmpeg can read, up to {MAX_PIXELS / 1e6:.0f} megapixels a frame"
     fix = f"copy it again, or convert it: ffmpeg -i {path.name} video.mp4"
@@ -165,27 +154,10 @@ def _unreadable(path: Path, reason: str) -> UserError:
 
 
 class Live(FrameSource):
-    """Frame source of a camera or a network stream.
+    """Frame source of a camera (number or device path) or a network stream (URL)."""
 
-    Args:
-        address: Camera number, device path, or URL of a stream.
-        opened: Opens the address; the result has ``isOpened``, ``read``, ``get`` and ``release`` of
-            ``cv2.VideoCapture``.
-        clock: Returns seconds since 1970.
-        first_s: Timeout of the first frame, seconds.
-        stalled_s: Timeout of each further frame, seconds.
-    """
-
-    def __init__(
-        self,
-        address: int | str,
-        opened: Callable[[int | str], Any] | None = None,
-        clock: Callable[[], float] = time.time,
-        first_s: float = FIRST_S,
-        stalled_s: float = STALLED_S,
-    ) -> None:
-        self._address, self._opened, self._clock = address, opened or _open_live, clock
-        self._timeouts = first_s, stalled_s
+    def __init__(self, address: int | str) -> None:
+        self._address = address
         self.name = f"camera {address}" if isinstance(address, int) else _without_login(address)
         self.stem = re.sub(r"[^\w.]+", "_", self.name.partition("?")[0]).strip("_")
         self.rate = _plausible_rate(0.0)
@@ -197,16 +169,17 @@ class Live(FrameSource):
             UserError: The camera or stream cannot be opened.
             RunError: The camera has stopped delivering frames.
         """
-        capture = self._opened(self._address)
+        capture = _open_live(self._address)
         if not capture.isOpened():
-            is_number = isinstance(self._address, int)
-            allowed = "the number of a connected camera" if is_number else "the address of a stream"
-            by_number = "close other programs that use it, or try camera 0 or 1"
-            fix = by_number if is_number else "test the address with another player, e.g. ffplay"
+            allowed = "the address of a stream"
+            fix = "test the address with another player, e.g. ffplay"
+            if isinstance(self._address, int):
+                allowed = "the number of a connected camera"
+                fix = "close other programs that use it, or try camera 0 or 1"
             raise UserError(f"{self.name}, which cannot be opened", allowed, fix)
         self.rate = _plausible_rate(capture.get(cv2.CAP_PROP_FPS))
-        reader = _NewestFrame(capture, self.name, self._clock)
-        timeout, num_requests = self._timeouts[0], 0
+        reader = _NewestFrame(capture, self.name)
+        timeout, num_requests = FIRST_S, 0
         try:
             while True:
                 frame = reader.wait(timeout)
@@ -216,7 +189,7 @@ class Live(FrameSource):
                     raise RunError(f"{reason}; check its cable or network")
                 if num_requests % stride == 0:
                     yield frame
-                timeout, num_requests = self._timeouts[1], num_requests + 1
+                timeout, num_requests = STALLED_S, num_requests + 1
         finally:
             reader.stop()
 
@@ -224,8 +197,8 @@ class Live(FrameSource):
 class _NewestFrame:
     """Reads a ``cv2.VideoCapture`` in a thread and keeps the newest frame."""
 
-    def __init__(self, capture: Any, name: str, clock: Callable[[], float]) -> None:
-        self._capture, self._name, self._clock = capture, name, clock
+    def __init__(self, capture: Any, name: str) -> None:
+        self._capture, self._name = capture, name
         self._newest: tuple[Any, int, float] | None = None
         self._fresh, self._stopped = threading.Condition(), threading.Event()
         # A thread that hangs in a driver must not keep the process alive.
@@ -256,18 +229,14 @@ class _NewestFrame:
                 self._stopped.wait(_RETRY_S)
                 continue
             with self._fresh:
-                self._newest = (image, number, self._clock())
+                self._newest = (image, number, time.time())
                 self._fresh.notify()
             number += 1
         self._capture.release()
 
 
 def is_url(text: str) -> bool:
-    """Return whether a text is the URL of a stream.
-
-    Raises:
-        UserError: The URL has another scheme than :data:`SCHEMES`.
-    """
+    """Return whether a text is the URL of a stream; reject schemes other than SCHEMES."""
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]*)://", text)
     if scheme is None:
         return False

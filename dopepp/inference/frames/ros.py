@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,7 +19,7 @@ import numpy as np
 from dopepp.core.errors import UserError, require
 from dopepp.drawing.pictures import MAX_PIXELS, RGBImage, whole_image
 from dopepp.geometry.camera import crop_camera, resize_camera
-from dopepp.geometry.camera_file import Camera, Crop, camera_of_fields
+from dopepp.geometry.camera_file import Camera, camera_of_fields
 from dopepp.inference.frames.source import CameraFrame, FrameSource
 
 if TYPE_CHECKING:
@@ -30,9 +29,9 @@ RAW: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA: Final = "sensor_msgs/msg/CameraInfo"
 
-BAGS: Final = (".bag", ".mcap", ".db3")
-"""Suffixes of recordings; ROS 2 also records into folders with a ``metadata.yaml``."""
+BAGS: Final = (".bag", ".mcap", ".db3")  # ROS 2 also records into folders with a `metadata.yaml`
 
+# Bytes per pixel, and OpenCV's conversion to RGB.
 ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -48,7 +47,6 @@ ENCODINGS: Final[dict[str, tuple[int, int | None]]] = {
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
-"""Bytes per pixel, and OpenCV's conversion to RGB."""
 
 
 def decode_image(message: Any) -> RGBImage:
@@ -84,74 +82,51 @@ def info_topic(topic: str) -> str:
     return f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
 
 
-@dataclass(frozen=True)
-class CameraInfo:
-    """Content of a ``camera_info`` message."""
+def is_cropped(info: Any) -> bool:
+    """Return whether the images of a ``camera_info`` message show a region of the sensor."""
+    return bool(info.roi.width and info.roi.height)
 
-    size: tuple[int, int]  # (width, height) of the sensor's image, which K and P belong to, pixels
-    model: str  # distortion model
-    D: Sequence[float]  # distortion coefficients
-    K: Sequence[float]  # camera matrix, 9 numbers row by row
-    P: Sequence[float]  # projection matrix of undistorted images, 12 numbers row by row
-    binning: tuple[int, int] = (1, 1)  # sensor pixels per image pixel, across and down
-    roi: Crop | None = None  # region of the sensor that is read out; None is the whole sensor
-    frame_id: str = ""  # camera frame
 
-    @classmethod
-    def from_message(cls, message: Any) -> CameraInfo:
-        """Read a message of ROS 1 (fields D, K, P) or ROS 2 (d, k, p)."""
-        matrices = {}
-        for name in ("D", "K", "P"):
-            values = getattr(message, name if hasattr(message, name) else name.lower())
-            matrices[name] = [float(value) for value in values]
-        roi = message.roi
-        crop = (int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
-        return cls(
-            (int(message.width), int(message.height)),
-            message.distortion_model,
-            **matrices,
-            binning=(max(1, int(message.binning_x)), max(1, int(message.binning_y))),
-            roi=crop if crop[2] and crop[3] else None,
-            frame_id=message.header.frame_id,
+def camera_of_info(info: Any, source: str, rectified: bool) -> Camera:
+    """Return the pinhole camera of a ``camera_info`` message of ROS 1 (D, K, P) or 2 (d, k, p).
+
+    Of undistorted images (``rectified``), P applies instead of K. K and P belong to the sensor's
+    image, of which the region of interest may be read out, with binning.
+
+    Raises:
+        UserError: The camera is not calibrated, or is not a pinhole camera.
+        ValueError: A field has a wrong type or length.
+    """
+
+    def numbers(name: str) -> list[float]:
+        return [float(x) for x in getattr(info, name if hasattr(info, name) else name.lower())]
+
+    if not any(numbers("K")):
+        raise UserError(
+            f"{source}, whose K is all zeros",
+            "the camera_info of a calibrated camera",
+            "calibrate it (`dopepp calibrate camera`) and give the driver the file, or pass it "
+            "here: --camera camera.yaml",
         )
-
-    def camera(self, source: str, rectified: bool) -> Camera:
-        """Return the pinhole camera of the images.
-
-        Args:
-            source: Origin of the message, for error messages.
-            rectified: Whether the images are undistorted, so that P applies instead of K.
-
-        Raises:
-            UserError: The camera is not calibrated, or is not a pinhole camera.
-        """
-        if not any(self.K):
-            raise UserError(
-                f"{source}, whose K is all zeros",
-                "the camera_info of a calibrated camera",
-                "calibrate it (`dopepp calibrate camera`) and give the driver the file, or pass it "
-                "here: --camera camera.yaml",
-            )
-        fields: dict[str, object] = {"image_width": self.size[0], "image_height": self.size[1]}
-        if rectified:
-            fields["K"] = np.reshape(self.P, (3, 4))[:, :3].ravel().tolist()
-        else:
-            fields |= {"K": [*self.K], "D": [*self.D], "distortion_model": self.model}
-        sensor = camera_of_fields(fields, source)
-        if self.roi is None and self.binning == (1, 1):
-            return sensor
-        x, y, width, height = self.roi or (0, 0, *self.size)
-        across, down = self.binning
-        K = resize_camera(crop_camera(sensor.K, x, y), 1 / across, 1 / down)
-        return Camera((width // across, height // down), K, sensor.distortion, source)
+    region = 0, 0, int(info.width), int(info.height)
+    fields: dict[str, object] = {"image_width": region[2], "image_height": region[3]}
+    if rectified:
+        fields["K"] = np.reshape(numbers("P"), (3, 4))[:, :3].ravel().tolist()
+    else:
+        lens = {"D": numbers("D"), "distortion_model": info.distortion_model}
+        fields |= {"K": numbers("K"), **lens}
+    sensor = camera_of_fields(fields, source)
+    if is_cropped(info):
+        roi = info.roi
+        region = int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+    x, y, width, height = region
+    across, down = max(1, int(info.binning_x)), max(1, int(info.binning_y))
+    K = resize_camera(crop_camera(sensor.K, x, y), 1 / across, 1 / down)
+    return Camera((width // across, height // down), K, sensor.distortion, source)
 
 
 class Bag(FrameSource):
-    """Images of one topic of a ROS recording.
-
-    Args:
-        path: File or folder of the recording.
-        topic: Image topic; required if several topics have images.
+    """Images of one topic of a ROS recording; the topic is required if several have images.
 
     Raises:
         UserError: The extra ``bags`` is not installed, the recording is unreadable or has no
@@ -170,11 +145,7 @@ class Bag(FrameSource):
         self.rate = max(1.0, (self.count - 1) / seconds) if seconds > 0 else 1.0
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th image.
-
-        Raises:
-            UserError: An image is damaged.
-        """
+        """Yield every ``stride``-th image; raise a ``UserError`` if an image is damaged."""
         for number, (seconds, message) in enumerate(self._messages([self.topic], RAW, COMPRESSED)):
             if number % stride:
                 continue
@@ -189,15 +160,13 @@ class Bag(FrameSource):
         """Camera of the images' ``camera_info``; None if the recording has none."""
         topic = info_topic(self.topic)
         for _, message in self._messages([topic], CAMERA):
-            info = CameraInfo.from_message(message)
-            return info.camera(f"{self._path} {topic}", is_rectified(self.topic))
+            return camera_of_info(message, f"{self._path} {topic}", is_rectified(self.topic))
         return None
 
     def messages(self) -> Iterator[tuple[float, Any, Any | None]]:
-        """Yield time (seconds since 1970), image message and latest ``camera_info`` of each image.
+        """Yield time (seconds since 1970), message and latest ``camera_info``, if any, of an image.
 
-        Images before the first ``camera_info`` message are paired with that message. The third
-        value is None if the recording has no ``camera_info``.
+        Images before the first ``camera_info`` message are paired with that message.
         """
         topic = info_topic(self.topic)
         info = next((message for _, message in self._messages([topic], CAMERA)), None)
@@ -215,11 +184,8 @@ class Bag(FrameSource):
         store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
         decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         with self._opened() as reader:
-            links = [
-                link
-                for link in reader.connections
-                if link.topic in topics and link.msgtype in kinds
-            ]
+            every = reader.connections
+            links = [link for link in every if link.topic in topics and link.msgtype in kinds]
             # Without a selected connection, the reader would yield the messages of every topic.
             for link, recorded_ns, content in reader.messages(links) if links else ():
                 message: Any = decode(content, link.msgtype)
@@ -241,11 +207,7 @@ class Bag(FrameSource):
             raise self._unreadable(f"{error}") from error
 
     def _select(self, links: Sequence[Connection], topic: str | None) -> str:
-        """Return the requested image topic, or the only image topic.
-
-        Raises:
-            UserError: The recording lacks the requested topic, or has no or several image topics.
-        """
+        """Return the requested image topic, or the only image topic, or raise a ``UserError``."""
         names = sorted({link.topic for link in links})
         if topic in names or (topic is None and len(names) == 1):
             return topic or names[0]

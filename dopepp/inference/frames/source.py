@@ -26,19 +26,12 @@ class CameraFrame:
 
 
 class FrameSource(ABC):
-    """Sequence of camera frames.
+    """Sequence of camera frames."""
 
-    Attributes:
-        name: Name for messages and output files, without passwords.
-        stem: File name without suffix for outputs about this source.
-        count: Number of frames; None if unknown.
-        rate: Frames per second; None for separate images.
-    """
-
-    name: str
-    stem: str
-    count: int | None = None
-    rate: float | None = None
+    name: str  # for messages and output files, without passwords
+    stem: str  # file name without suffix for outputs about this source
+    count: int | None = None  # number of frames; None if unknown
+    rate: float | None = None  # frames per second; None for separate images
 
     @property
     def camera(self) -> Camera | None:

@@ -1,9 +1,8 @@
 """Calibration boards: printing at true scale, detection in images, and their poses.
 
 A board's frame has x to the right, y down and z into the board. Its origin is the board's upper
-left corner (ChArUco) or the first point (other kinds). :func:`draw_view` renders images of a board
-for simulated calibrations. To add a kind of board, extend :meth:`Board.points`,
-:meth:`Board.drawing` and the ``_detect_`` methods.
+left corner (ChArUco) or the first point (other kinds). To add a kind of board, extend
+:meth:`Board.points`, :meth:`Board.drawing` and the ``_detect_`` methods.
 """
 
 from __future__ import annotations
@@ -26,9 +25,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.camera_file import Camera
 
-PX_PER_MM: Final = 10
-"""Resolution of a printed board: 254 dots per inch, exact for tenths of millimetres."""
-
+PX_PER_MM: Final = 10  # of a printed board: 254 dots per inch, exact for tenths of millimetres
 MARGIN_MM: Final = 10
 LONGEST_MM: Final = 1200
 MIN_POINTS: Final = 8  # fewer points do not separate a board's tilt from its distance
@@ -38,7 +35,6 @@ SPELLING: Final = (
 )
 NUM_FIELDS: Final = {"charuco": (3, 4), "chess": (2, 2), "circles": (2, 2)}
 DICTIONARY: Final = "5X5_100"
-
 PIXEL_NOISE: Final = 0.1  # smallest standard deviation of a detected point, pixels
 OVERSAMPLING: Final = 2
 BACKGROUND: Final = 110
@@ -52,8 +48,8 @@ class BoardDetection:
     """Points of a calibration board that are detected in an image."""
 
     name: str  # name of the image
-    points: Float[np.ndarray, "n 3"]  # positions of the detected points on the board, metres
-    pixels: Float[np.ndarray, "n 2"]  # positions of these points in the image, pixels
+    points: Float[np.ndarray, "n 3"]  # detected points in the board's frame, metres
+    pixels: Float[np.ndarray, "n 2"]  # these points in the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +58,9 @@ class BoardPose:
 
     name: str  # name of the image
     T_cam_board: Transform
-    # Covariance of the rotation about the board's origin (radians) and translation (metres),
-    # camera axes
+    # Of the rotation about the board's origin (radians) and translation (metres), camera axes
     covariance: Float[np.ndarray, "6 6"]
-    error_px: float  # RMS reprojection error, pixels
-    distance: float  # depth of the mean of the detected points along the optical axis, metres
+    distance: float  # depth of the mean of the detected points, metres
 
 
 @dataclass(frozen=True)
@@ -92,10 +86,7 @@ class Board:
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
     def detect(self, image: RGBImage, name: str) -> BoardDetection | None:
-        """Detect the board in an RGB image.
-
-        Returns:
-            The detection, or None if fewer than 8 points are found.
+        """Detect the board in an RGB image; return None if fewer than 8 points are found.
 
         Raises:
             UserError: The image shows two ChArUco markers of the same number, i.e. two boards.
@@ -104,9 +95,8 @@ class Board:
         indices, pixels = getattr(self, f"_detect_{self.kind}")(grey)
         if len(indices) < MIN_POINTS:
             return None
-        return BoardDetection(
-            name, self.points[indices], np.asarray(pixels, np.float64).reshape(-1, 2)
-        )
+        pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
+        return BoardDetection(name, self.points[indices], pixels)
 
     @property
     def first_px(self) -> float:
@@ -137,10 +127,8 @@ class Board:
         """Write a PDF or PNG to print; return a text with the page's size and printing advice."""
         check_target(path, (".pdf", ".png"))
         page, content, dpi = self.drawing(), io.BytesIO(), PX_PER_MM * 25.4
-        if path.suffix.lower() == ".pdf":
-            Image.fromarray(page).save(content, "PDF", resolution=dpi)
-        else:
-            Image.fromarray(page).save(content, "PNG", dpi=(dpi, dpi))
+        kind = path.suffix[1:].upper()
+        Image.fromarray(page).save(content, kind, resolution=dpi, dpi=(dpi, dpi))
         write_file(path, content.getvalue())
         height, width = (side / PX_PER_MM for side in page.shape)
         return f"{width:g} × {height:g} mm; print at 100 %, not fitted to the page, and measure it"
@@ -168,7 +156,6 @@ class Board:
         is_found, pixels = cv2.findChessboardCornersSB(grey, (self.columns, self.rows), None)
         if not is_found:
             return [], []
-        pixels = pixels.reshape(-1, 2)
         # The detector may start at either end of the board. Of the two squares compared here, the
         # first is the darker one if the detector starts at the board's origin.
         grid = pixels.reshape(self.rows, self.columns, 2)
@@ -195,8 +182,14 @@ def parse_board(text: str) -> Board:
     Raises:
         UserError: The description cannot be parsed, or the board breaks a rule, e.g. on its size.
     """
+    kind, *fields = text.split(":")
+    fewest, most = NUM_FIELDS.get(kind, (1, 0))
     try:
-        board = _parse(text)
+        if not fewest <= len(fields) <= most:
+            raise ValueError(text)
+        columns, rows = (int(number) for number in fields[0].lower().split("x"))
+        spacing, *marker = (float(length) / 1000 for length in fields[1:3])
+        board = Board(kind, columns, rows, spacing, sum(marker), (*fields[3:], DICTIONARY)[0])
         allowed = _violated_rule(board)
     except ValueError:
         allowed = SPELLING
@@ -204,18 +197,6 @@ def parse_board(text: str) -> Board:
         fix = "describe the printed board, e.g. charuco:8x11:20:15"
         raise UserError(f"board {text!r:.100}", allowed, fix)
     return board
-
-
-def _parse(text: str) -> Board:
-    """Parse a board's description; raise a ``ValueError`` if it does not follow the notation."""
-    kind, _, rest = text.partition(":")
-    fields = rest.split(":")
-    fewest, most = NUM_FIELDS.get(kind, (0, 0))
-    if not fewest <= len(fields) <= most:
-        raise ValueError(text)
-    columns, rows = (int(number) for number in fields[0].lower().split("x"))
-    spacing, *marker = (float(length) / 1000 for length in fields[1:3])
-    return Board(kind, columns, rows, spacing, sum(marker), (*fields[3:], DICTIONARY)[0])
 
 
 def _violated_rule(board: Board) -> str:
@@ -265,29 +246,28 @@ def board_pose(detection: BoardDetection, camera: Camera) -> BoardPose:
     jacobian = _pose_jacobian(points, T, camera)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * noise
     distance = float((T[:3, :3] @ points.mean(axis=0) + T[:3, 3])[2])
-    return BoardPose(detection.name, T, covariance, float(np.sqrt(error / len(points))), distance)
+    return BoardPose(detection.name, T, covariance, distance)
 
 
 def _pose_jacobian(
     points: Float[np.ndarray, "n 3"], T: Transform, camera: Camera
 ) -> Float[np.ndarray, "m 6"]:
     """Return the derivative of the projected points (px) with respect to `displace`'s step."""
-    columns = []
-    for step in np.diag([1e-5] * 3 + [1e-6] * 3):
-        sides = []
-        for delta in (-step, step):
-            moved = displace(T[None], delta[None])[0]
-            rotation = cv2.Rodrigues(moved[:3, :3])[0]
-            lens = (camera.K, camera.coefficients)
-            sides.append(cv2.projectPoints(points, rotation, moved[:3, 3], *lens)[0])
-        columns.append((sides[1] - sides[0]).ravel() / (2 * step.max()))
+
+    def projection(step: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m"]:
+        moved = displace(T[None], step[None])[0]
+        pose = cv2.Rodrigues(moved[:3, :3])[0], moved[:3, 3]
+        return np.ravel(cv2.projectPoints(points, *pose, camera.K, camera.coefficients)[0])
+
+    steps = np.diag([1e-5] * 3 + [1e-6] * 3)
+    columns = [(projection(step) - projection(-step)) / (2 * step.max()) for step in steps]
     return np.stack(columns, axis=1)
 
 
 def displace(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
-    """Rotate and translate poses in parent axes, each about the pose's origin.
+    """Rotate (rotation vector, radians) and translate (metres) poses in parent axes.
 
-    ``step`` has a rotation vector (radians) and a translation (metres) for each pose.
+    The rotation is about each pose's origin.
     """
     moved = T.copy()
     moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
@@ -302,10 +282,7 @@ def draw_view(
     rng: np.random.Generator,
     noise: float = 4.0,
 ) -> RGBImage:
-    """Render a board with lens distortion, blur and noise; each pixel averages 2×2 rays.
-
-    ``noise`` is the standard deviation of the Gaussian pixel noise in grey levels (0 to 255).
-    """
+    """Render a board with lens distortion, blur and Gaussian noise (grey levels, 0 to 255)."""
     assert camera.size is not None
     width, height = camera.size
     steps = (np.arange(OVERSAMPLING) + 0.5) / OVERSAMPLING - 0.5
@@ -314,7 +291,7 @@ def draw_view(
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2)
     rays = cv2.undistortPoints(pixels, camera.K, camera.coefficients)[:, 0]
     R, t = T_cam_board[:3, :3], T_cam_board[:3, 3]
-    # A point of the board, (x, y, 0), projects to R[:, :2] (x, y) + t.
+    # A point (x, y, 0) of the board is at R[:, :2] (x, y) + t in the camera.
     homography = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t]))
     on_board = np.column_stack([rays, np.ones(len(rays))]) @ homography.T
     on_page = 1000 * PX_PER_MM * on_board[:, :2] / on_board[:, 2:]

@@ -37,16 +37,9 @@ MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 Covariances = Float[np.ndarray, "poses 6 6"]
 Residuals = Float[np.ndarray, "poses 6"]  # rotations (radians), translations (metres), camera axes
 Noise = Float[np.ndarray, "2"]  # standard deviations of a robot's pose: radians, metres
-
 MIN_POSES: Final = 3
-
-ROBOT_NOISE: Final = (0.0005, 0.0005)
-"""Initial standard deviations of a robot's pose, radians and metres."""
-
-OUTLIER: Final = 40.0
-"""Squared Mahalanobis distance above which a pose is rejected. With six degrees of freedom, one in
-two million correct poses exceeds it."""
-
+ROBOT_NOISE: Final = (0.0005, 0.0005)  # initial standard deviations, radians and metres
+OUTLIER: Final = 40.0  # squared Mahalanobis distance; one in two million correct poses exceeds it
 MEDIAN_CHI2: Final = 5.348  # median of chi-squared with six degrees of freedom
 
 
@@ -57,8 +50,7 @@ class HandEye:
     mount: Mount  # `hand` (the camera is on the flange) or `bench`
     T_mount_cam: Transform  # T_flange_cam, or T_base_cam of a camera on the bench
     T_other_board: Transform  # T_base_board, or T_flange_board of a camera on the bench
-    # Covariance of the camera's rotation about its origin (radians) and translation (metres),
-    # camera axes
+    # Of the camera's rotation about its origin (radians) and translation (metres), camera axes
     covariance: Float[np.ndarray, "6 6"]
     # Rotation (radians) and distance (metres) between each observed and predicted T_cam_board
     rotation_errors: Float[np.ndarray, "poses"]
@@ -71,11 +63,6 @@ def calibrate_hand_eye(
     T_base_flange: Transforms, boards: Sequence[BoardPose], mount: Mount
 ) -> HandEye:
     """Estimate the camera's pose on its mount from poses of the flange and of the board.
-
-    Args:
-        T_base_flange: Poses of the flange that the robot reports, metres.
-        boards: Pose of the board in the image taken at each flange pose, in the same order.
-        mount: ``hand`` for a camera on the flange, ``bench`` for a fixed camera.
 
     Raises:
         UserError: There are fewer than three poses.
@@ -116,7 +103,7 @@ def robot_world_equations(
     M = np.asarray(T_base_flange, np.float64)
     B = np.stack([board.T_cam_board for board in boards])
     covariances = np.stack([board.covariance for board in boards])
-    return (M if mount == "hand" else invert_transforms(M)), B, covariances
+    return (M if mount == "hand" else np.linalg.inv(M)), B, covariances
 
 
 def park(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
@@ -141,7 +128,7 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
     vec(R_Y) = (R_C ⊗ R_M) vec(R_X) with C = B⁻¹, so both rotations are the leading singular
     vectors of the sum over all poses. The translations solve a linear system.
     """
-    C = invert_transforms(B)
+    C = np.linalg.inv(B)
     kronecker = np.einsum("nij,nkl->ikjl", C[:, :3, :3], M[:, :3, :3]).reshape(9, 9)
     left, _, right = np.linalg.svd(kronecker)
     matrices = (vector.reshape(3, 3).T for vector in (left[:, 0], right[0]))  # up to their signs
@@ -155,7 +142,7 @@ def shah(M: Transforms, B: Transforms) -> tuple[Transform, Transform]:
 def relative_motions(M: Transforms, B: Transforms) -> tuple[Transforms, Transforms]:
     """Return the motions M_j⁻¹ M_i of the robot and B_j B_i⁻¹ of the board for all pairs i < j."""
     i, j = np.triu_indices(len(M), 1)
-    return invert_transforms(M)[j] @ M[i], B[j] @ invert_transforms(B)[i]
+    return np.linalg.inv(M)[j] @ M[i], B[j] @ np.linalg.inv(B)[i]
 
 
 def refine(
@@ -163,16 +150,7 @@ def refine(
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
     """Refine X and Y of M_i X B_i = Y by least squares with a soft L1 loss.
 
-    Args:
-        M: Transforms of the robot, as in :func:`robot_world_equations`.
-        B: Poses T_cam_board of the board.
-        B_cov: Covariances of B, as in :class:`.BoardPose`.
-        X: Initial pose of the camera.
-        Y: Initial pose of the board.
-        robot: Standard deviations of the robot's rotation (radians) and position (metres).
-
-    Returns:
-        X, Y, and the covariance of X (see :class:`HandEye`).
+    ``B_cov`` are the covariances of B. Returns X, Y, and the covariance of X (:class:`HandEye`).
     """
     whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, B_cov, robot)))
 
@@ -191,7 +169,7 @@ def refine(
 
 def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Residuals:
     """Return rotation (rad) and translation (m) from X⁻¹ M⁻¹ Y, the expected board pose, to B."""
-    expected = invert_transform(X) @ invert_transforms(M) @ Y
+    expected = invert_transform(X) @ np.linalg.inv(M) @ Y
     rotvec = Rotation.from_matrix(B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([rotvec, B[:, :3, 3] - expected[:, :3, 3]], axis=1)
 
@@ -200,12 +178,12 @@ def _covariances(
     M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
 ) -> Covariances:
     """Return the covariances of :func:`_residuals`: ``B_cov`` plus the propagated robot noise."""
-    # Derivative of the board's pose by a small rotation (about the origin of the camera's mount)
-    # and translation of the robot's pose.
+    # Derivative of the board's pose by the robot's, which rotates about the mount's origin.
     to_cam = X[:3, :3].T
     jacobian = np.zeros((len(M), 6, 6))
     jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam
-    jacobian[:, 3:, :3] = -to_cam @ _cross((invert_transforms(M) @ Y)[:, :3, 3])
+    shifts = (np.linalg.inv(M) @ Y)[:, None, :3, 3]
+    jacobian[:, 3:, :3] = -to_cam @ np.cross(np.eye(3), shifts)  # matrices of v ↦ shift × v
     variances = np.diag(np.repeat(robot**2, 3))
     return np.asarray(B_cov + jacobian @ variances @ jacobian.transpose(0, 2, 1))
 
@@ -227,19 +205,3 @@ def _distances(
     residuals = _residuals(M, B, X, Y)
     whole = np.linalg.solve(_covariances(M, X, Y, B_cov, robot), residuals[..., None])[..., 0]
     return np.asarray((residuals * whole).sum(axis=1))
-
-
-def invert_transforms(T: Transforms) -> Transforms:
-    """Return the inverses of rigid transforms."""
-    R = T[:, :3, :3].transpose(0, 2, 1)
-    inverse = np.tile(np.eye(4), (len(T), 1, 1))
-    inverse[:, :3, :3] = R
-    inverse[:, :3, 3] = -(R @ T[:, :3, 3:])[..., 0]
-    return inverse
-
-
-def _cross(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return the matrix [v]× of each vector v, with [v]× w = v × w."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

@@ -21,29 +21,22 @@ from dopepp.robot.calibration.board import MIN_POINTS, BoardDetection
 MIN_VIEWS: Final = 6  # smallest number of views of a reliable calibration; 3 views determine K
 CELLS: Final = (8, 6)  # columns and rows of the grid that measures the coverage
 MIN_COVERAGE: Final = 0.5
+# Standard deviation of the boards' normals, about 12°. Smaller tilts do not separate the focal
+# length from the distance.
 MIN_TILT: Final = 0.2
-"""Standard deviation of the boards' normals, about 12°. Smaller tilts do not separate the focal
-length from the distance."""
-
 MAX_ERROR_PX: Final = 1.0
 OUTLIER: Final = 3.0  # smallest error of a rejected view, as a multiple of the median error
 MIN_OUTLIER_PX: Final = 0.5
-
-MIN_SHIFT: Final = 0.04
-"""Mean shift of the points between two distinct views, as a share of the image's width."""
-
+MIN_SHIFT: Final = 0.04  # mean shift of points between distinct views, share of the image's width
 MAX_VIEWS: Final = 60
 CHECKS_PER_S: Final = 5.0  # frames of a video in which the board is searched, per second
 
 
 class Views:
-    """Collection of distinct views of a board: their points are shifted by 4 % of the image width.
+    """Distinct views of a board, whose points are shifted by 4 % of the image width (pixels).
 
     Of similar views, the view with the smallest shift from the previous frame is kept, so that
     sharp frames of a video replace frames with motion blur.
-
-    Args:
-        width: Width of the images, pixels.
     """
 
     def __init__(self, width: int) -> None:
@@ -86,9 +79,9 @@ class LensCalibration:
     """Intrinsics of a camera from images of a board, and measures of their quality."""
 
     camera: Camera
-    error_px: float  # RMS reprojection error over all used views, pixels
+    error_px: float  # RMS reprojection error over all used views
     names: tuple[str, ...]  # image of each view used in the calibration
-    errors_px: Float[np.ndarray, "views"]  # RMS reprojection error of each view, pixels
+    errors_px: Float[np.ndarray, "views"]  # RMS reprojection error of each view
     outliers: tuple[str, ...]  # names of views rejected for large errors
     coverage: float  # share of the 8×6 image cells that contain a detected point, 0 to 1
     covered: Bool[np.ndarray, "rows columns"]  # image cells that contain a detected point
@@ -100,10 +93,6 @@ def calibrate_lens(detections: Sequence[BoardDetection], size: Size) -> LensCali
     """Estimate a camera's intrinsics and lens distortion from views of a board.
 
     Views with a reprojection error above 0.5 px and 3 times the median are rejected once.
-
-    Args:
-        detections: Detected points of the board, one detection per image.
-        size: Width and height of the images, pixels.
 
     Raises:
         UserError: There are fewer than three views, or OpenCV cannot solve for the camera.
@@ -129,6 +118,8 @@ def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
     """Calibrate the camera with OpenCV from all views, without rejection of outliers."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
+    num_threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # threads add up in random order, and the result would differ every time
     try:
         error_px, K, lens, rotations, _, deviations, _, errors_px = cv2.calibrateCameraExtended(
             points, pixels, size, None, None
@@ -137,13 +128,13 @@ def _calibrate(views: Sequence[BoardDetection], size: Size) -> LensCalibration:
         problem = f"{len(views)} views of the board, which do not determine a camera ({reason.err})"
         allowed = "views tilted by 20 to 40° in several directions"
         raise UserError(problem, allowed, "take more images of the tilted board") from reason
+    finally:
+        cv2.setNumThreads(num_threads)
     normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilt = float(np.linalg.norm(normals[:, :2].std(axis=0)))
-    columns, rows = (
-        np.linspace(-0.5, side - 0.5, count + 1) for side, count in zip(size, CELLS, strict=True)
-    )
     x, y = np.concatenate([view.pixels for view in views]).T
-    covered = np.histogram2d(y, x, bins=(rows, columns))[0] > 0
+    borders = ((-0.5, size[1] - 0.5), (-0.5, size[0] - 0.5))
+    covered = np.histogram2d(y, x, CELLS[::-1], borders)[0] > 0
     coverage = float(covered.mean())
     return LensCalibration(
         Camera(size, np.asarray(K), tuple(np.ravel(lens)[:5].tolist()), "calibration"),

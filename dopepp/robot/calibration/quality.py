@@ -21,7 +21,6 @@ from dopepp.robot.calibration.hand_eye import (
     MOUNTS,
     HandEye,
     Mount,
-    invert_transforms,
     refine,
     relative_motions,
     robot_world_equations,
@@ -30,16 +29,11 @@ from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
 
 MIN_ROTATION: Final = np.radians(5.0)  # smallest valid maximum of the rotations between two poses
-MAX_ROTATION_ERROR: Final = np.radians(1.5)
-"""Largest median rotation error over pairs under the correct convention, radians."""
-MAX_SHIFT_ERROR: Final = 0.01
-"""Largest median translation error over pairs under the correct convention, metres."""
+# Largest median errors over pairs under the correct convention, radians and metres.
+MAX_ROTATION_ERROR, MAX_SHIFT_ERROR = np.radians(1.5), 0.01
 SCALE: Final = 1.03  # largest negligible factor between the robot's and the camera's lengths
 MIN_POSES: Final = 8
-
-MIN_DIVERSITY: Final = np.radians(15.0)
-"""Smallest RMS rotation over pairs about the second main axis (:class:`CalibrationQuality`)."""
-
+MIN_DIVERSITY: Final = np.radians(15.0)  # RMS rotation over pairs about the second main axis
 MAX_ERROR: Final = 0.003  # largest standard deviation at the board's distance, metres
 MAX_ROTATION: Final = np.radians(0.5)  # largest standard deviation of the rotation
 MIN_USED: Final = 0.7  # share of poses that agree with each other
@@ -53,12 +47,12 @@ class MotionAgreement:
     """
 
     rotation: float  # median rotation error over pairs, radians
-    shift: float  # median translation error over pairs, metres
+    shift: float  # median translation error over pairs after correction by ``scale``, metres
     scale: float  # factor by which the robot's lengths must be multiplied to fit the board's
 
     @property
     def is_rigid(self) -> bool:
-        """Whether the median errors are below 1.5° and 10 mm after correction by ``scale``."""
+        """Whether the median errors are below 1.5° and 10 mm."""
         return self.rotation < MAX_ROTATION_ERROR and self.shift < MAX_SHIFT_ERROR
 
     @property
@@ -68,16 +62,9 @@ class MotionAgreement:
 
 
 def compare_motions(T_base_flange: Transforms, B: Transforms, mount: Mount) -> MotionAgreement:
-    """Compare the motions of the robot's flange and of the board between all pairs of images.
-
-    Args:
-        T_base_flange: Poses of the flange that the robot reports, metres.
-        B: Pose T_cam_board of the board in the image at each flange pose, metres.
-        mount: Whether the camera is on the robot's hand or on the bench.
-    """
-    P, Q = relative_motions(
-        T_base_flange if mount == "hand" else invert_transforms(T_base_flange), B
-    )
+    """Compare the motions of the flange and of the board (B = T_cam_board) between all images."""
+    M = T_base_flange if mount == "hand" else np.linalg.inv(T_base_flange)
+    P, Q = relative_motions(M, B)
     alpha, beta = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (P, Q))
     used = np.minimum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)) < 3.0
     if used.sum() < 3:
@@ -114,12 +101,7 @@ def check_poses(
 ) -> Transforms:
     """Check that the robot's motions agree with the board's motions in the images.
 
-    Args:
-        poses: Robot poses of a file.
-        chosen: Index into ``poses`` for each entry of ``boards``.
-        pose_format: Conventions of the file: units, order of quaternions, direction.
-        boards: Poses of the board in the images.
-        mount: Whether the camera is on the robot's hand or on the bench.
+    ``chosen`` has an index into ``poses`` for each entry of ``boards``.
 
     Returns:
         T_base_flange of the chosen poses, metres.
@@ -232,8 +214,7 @@ class CalibrationQuality:
 
     shift: float  # expected error of positions at the board's distance (1 σ), metres
     rotation: float  # expected error of the camera's rotation (1 σ), radians
-    # Distance by which the camera moves if the calibration omits a pose, for each pose, metres
-    leave_one_out: Float[np.ndarray, "poses"]
+    leave_one_out: Float[np.ndarray, "poses"]  # motion of the camera without each pose, metres
     diversity: Vector  # RMS rotation over pairs about the 3 principal axes, radians, descending
     weakest: Vector  # direction of the largest position variance, unit vector in the mount's frame
     next_pose: str  # advice on the rotation that reduces the largest position variance
@@ -279,11 +260,9 @@ def assess(
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:
-    """Return the standard deviations, over all axes, of a point (metres) and a rotation (radians).
+    """Return standard deviations, over all axes, of a point (metres) and the rotation (radians).
 
-    Args:
-        covariance: Covariance of the camera's pose, as in :class:`HandEye`.
-        distance: Distance of the point from the camera along the optical axis, metres.
+    The point is on the optical axis at ``distance``; ``covariance`` is as in :class:`HandEye`.
     """
     across = np.array([[0, distance, 0], [-distance, 0, 0], [0, 0, 0]])
     jacobian = np.hstack([across, np.eye(3)])

@@ -25,8 +25,8 @@ from dopepp.core.files import check_target, read_limited, write_file
 from dopepp.core.json import read_json
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform
-
-UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
+from dopepp.geometry.rotation import is_rigid
+from dopepp.parts.part import UNITS
 
 ROTATIONS: Final = {
     "quaternion": ("qw", "qx", "qy", "qz"),
@@ -36,7 +36,7 @@ ROTATIONS: Final = {
 
 NAMES: Final = ("name", "image", "picture", "file", "filename")
 MAX_BYTES: Final = 4_000_000
-
+ROUNDED: Final = 1e-2  # largest absolute entry of R Rᵀ − I in a file
 FORMAT: Final = (
     "one record per pose with x, y, z and qw, qx, qy, qz or rx, ry, rz or roll, pitch, yaw "
     "(and the image's name)"
@@ -60,7 +60,7 @@ class RobotPoses:
     """Robot poses as written in a file, before conversion of units and conventions."""
 
     names: tuple[str, ...]  # file name of each image, empty if the record has none
-    positions: Float[np.ndarray, "poses 3"]  # x, y, z in the file's length unit
+    positions: Float[np.ndarray, "poses 3"]  # in the file's length unit
     kind: str  # representation of the rotations: a key of `ROTATIONS`, or `matrix`
     rotations: Float[np.ndarray, "poses numbers"]  # 4, 3 or (matrix, row by row) 9 numbers each
     source: str  # path of the file, for messages
@@ -122,11 +122,7 @@ def read_robot_poses(path: Path) -> RobotPoses:
 
 
 def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
-    """Read a CSV file of points x, y, z in the robot base's frame; return them in metres.
-
-    Args:
-        path: CSV file.
-        unit: Length unit of the file, a key of :data:`UNITS`.
+    """Read a CSV file of points x, y, z in a length unit (:data:`UNITS`); return metres.
 
     Raises:
         UserError: As for :func:`read_robot_poses`.
@@ -139,8 +135,8 @@ def _read_csv(path: Path) -> list[Record]:
     try:
         text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
     except (OSError, ValueError) as error:
-        fix = "pass the path of a CSV file in UTF-8"
         allowed = f"a readable CSV file of at most {MAX_BYTES / 1e6:g} MB"
+        fix = "pass the path of a CSV file in UTF-8"
         raise UserError(f"{path}: {error!s:.200}", allowed, fix) from error
     separator = ";" if text.partition("\n")[0].count(";") >= 3 else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=separator)
@@ -184,10 +180,8 @@ def _matrix(record: Record, row: int, path: Path) -> Transform:
     try:
         T = np.array(record["matrix"], np.float64).reshape(4, 4)
     except (KeyError, TypeError, ValueError):
-        T = np.full((4, 4), np.nan)
-    R = T[:3, :3]
-    is_rigid = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-2
-    if not is_rigid or np.linalg.det(R) < 0:
+        T = np.zeros((4, 4))
+    if not is_rigid(T, ROUNDED):
         problem = f"{path}, pose {row}: matrix={record.get('matrix')!r:.80}"
         allowed = "4×4 numbers of a rigid transform, row by row"
         raise UserError(problem, allowed, "write the 16 numbers, or delete that pose")
@@ -195,10 +189,9 @@ def _matrix(record: Record, row: int, path: Path) -> Transform:
 
 
 def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
-    """Match poses with images by name (with or without suffix) or, without names, by order.
+    """Return the pose's index by name of the image.
 
-    Returns:
-        Index of the pose by name of the image.
+    Names match with or without suffix; poses without names match by order.
 
     Raises:
         UserError: A pose names an image that does not exist, or there are no names and the numbers
@@ -227,14 +220,9 @@ def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
 def write_calibration(
     path: Path, kind: str, values: Mapping[str, Any], findings: Sequence[str], force: bool
 ) -> None:
-    """Write the result of a calibration to a YAML file.
+    """Write the result ``values`` of a calibration, e.g. ``hand-eye``, to a YAML file.
 
-    Args:
-        path: File with the suffix ``.yaml`` or ``.yml``.
-        kind: Kind of the calibration, e.g. ``hand-eye``.
-        values: Fields of the result, e.g. its matrix and errors.
-        findings: Reasons not to trust the calibration.
-        force: Whether to write despite findings; the file is then marked as not trusted.
+    With findings, i.e. reasons not to trust the calibration, the file is marked as not trusted.
 
     Raises:
         UserError: There are findings and ``force`` is false, or the file cannot be written.
@@ -249,11 +237,7 @@ def write_calibration(
 
 
 def check_trust(findings: Sequence[str], force: bool) -> None:
-    """Reject a calibration that has findings, i.e. reasons not to trust it.
-
-    Raises:
-        UserError: There are findings, and ``force`` is false.
-    """
+    """Reject a calibration that has findings, unless ``force`` is true."""
     if findings and not force:
         problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"
         fix = "measure again as advised, or add --force to write it anyway"

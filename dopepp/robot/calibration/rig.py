@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,7 +39,15 @@ MAX_STEPS: Final = 30  # a solution takes about ten
 Boards = Mapping[str, Mapping[str, BoardDetection]]
 """Detections of the board by camera and moment; a moment is the name of its images."""
 
-BoardPoses = Mapping[str, Mapping[str, BoardPose]]  # by camera and moment
+
+class _View(NamedTuple):
+    """A camera's image of the board at a moment."""
+
+    camera: str
+    moment: str
+    detection: BoardDetection
+    lens: Camera
+    pose: BoardPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +55,10 @@ class Rig:
     """Poses of several fixed cameras in the frame of the first camera, and their errors."""
 
     names: tuple[str, ...]  # names of the cameras; the frame of the first camera is the world
-    T_world_cam: Transforms  # pose of each camera
-    # Covariance of each camera's rotation about its centre (radians) and translation (metres),
-    # world axes
+    T_world_cam: Transforms
+    # Of each camera's rotation about its centre (radians) and translation (metres), world axes
     covariances: Float[np.ndarray, "cameras 6 6"]
-    errors_px: Float[np.ndarray, "cameras"]  # RMS reprojection error of each camera, pixels
+    errors_px: Float[np.ndarray, "cameras"]  # RMS reprojection error of each camera
     shared: tuple[int, ...]  # number of moments at which each camera and another see the board
     outliers: tuple[str, ...]  # moments that were rejected for their reprojection error
     findings: tuple[str, ...]  # reasons not to trust the rig, with remedies
@@ -67,10 +74,6 @@ class Rig:
 def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     """Estimate the poses of cameras from images of a board that they see together.
 
-    Args:
-        boards: Detections of the board by camera name and moment (name of the image).
-        cameras: Intrinsics of each camera, by the same names.
-
     Raises:
         UserError: The number of cameras is out of range, or a camera never sees the board together
             with the others.
@@ -81,27 +84,22 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
         raise UserError(f"a rig of {len(names)} cameras", allowed, "pass a folder for each camera")
     counts = Counter(moment for detections in boards.values() for moment in detections)
     shared = {moment for moment, count in counts.items() if count > 1}
-    poses = {
-        name: {
-            moment: board_pose(detection, cameras[name])
-            for moment, detection in boards[name].items()
-            if moment in shared
-        }
-        for name in names
-    }
-    adjustment, outliers = _Adjustment(boards, cameras, poses), list[str]()
+    views = [
+        _View(name, moment, detection, cameras[name], board_pose(detection, cameras[name]))
+        for name, detections in boards.items()
+        for moment, detection in detections.items()
+        if moment in shared
+    ]
+    adjustment, outliers = _Adjustment(names, views), list[str]()
     for limit_px in (START_PX, MIN_OUTLIER_PX):
         worst = adjustment.outliers(limit_px)
         outliers += worst
         if worst:
-            poses = {
-                name: {moment: pose for moment, pose in own.items() if moment not in worst}
-                for name, own in poses.items()
-            }
-            adjustment = _Adjustment(boards, cameras, poses)
+            views = [view for view in views if view.moment not in worst]
+            adjustment = _Adjustment(names, views)
         if worst or limit_px == START_PX:
             adjustment.solve()
-    counts_shared = tuple(len(poses[name]) for name in names)
+    counts_shared = tuple(sum(view.camera == name for view in views) for name in names)
     errors_px = adjustment.camera_errors_px()
     findings = [
         f"{name} sees the board with another camera {count} times: take at least {MIN_SHARED} "
@@ -119,15 +117,18 @@ def calibrate_rig(boards: Boards, cameras: Mapping[str, Camera]) -> Rig:
     return Rig(names, *solution, errors_px, counts_shared, tuple(outliers), tuple(findings))
 
 
-def _link_cameras(poses: BoardPoses) -> dict[str, Transform]:
-    """Return initial values of T_world_cam by camera name; the first camera is the world.
+def _link_cameras(names: Sequence[str], views: Sequence[_View]) -> list[Transform]:
+    """Return initial values of T_world_cam for each camera; the first camera is the world.
 
     The next camera is always the camera that shares most moments with a camera whose pose is known.
 
     Raises:
         UserError: A camera shares no moment with the cameras whose poses are known.
     """
-    first, *others = poses
+    poses: dict[str, dict[str, Transform]] = {name: {} for name in names}
+    for view in views:
+        poses[view.camera][view.moment] = view.pose.T_cam_board
+    first, *others = names
     linked = {first: np.eye(4)}
     while others:
         shared = {
@@ -144,21 +145,16 @@ def _link_cameras(poses: BoardPoses) -> dict[str, Transform]:
             raise UserError(problem, allowed, fix)
         steps = np.stack(
             [
-                poses[anchor][moment].T_cam_board
-                @ invert_transform(poses[name][moment].T_cam_board)
+                poses[anchor][moment] @ invert_transform(poses[name][moment])
                 for moment in shared[anchor, name]
             ]
         )
-        linked[name] = linked[anchor] @ _most_central(steps)
+        # The most central step has the smallest sum of Frobenius distances from the others.
+        flat = steps[:, :3].reshape(len(steps), -1)
+        distances = np.linalg.norm(flat[:, None] - flat[None], axis=2).sum(axis=1)
+        linked[name] = linked[anchor] @ steps[distances.argmin()]
         others.remove(name)
-    return {name: linked[name] for name in poses}
-
-
-def _most_central(steps: Transforms) -> Transform:
-    """Return the transform with the smallest sum of Frobenius distances from the others."""
-    flat = steps[:, :3].reshape(len(steps), -1)
-    distances = np.linalg.norm(flat[:, None] - flat[None], axis=2).sum(axis=1)
-    return np.asarray(steps[distances.argmin()])
+    return [linked[name] for name in names]
 
 
 class _Adjustment:
@@ -167,36 +163,30 @@ class _Adjustment:
     The unknowns are rotation and translation of each camera except the first, then of each board.
     """
 
-    def __init__(self, boards: Boards, cameras: Mapping[str, Camera], poses: BoardPoses) -> None:
-        start = _link_cameras(poses)
-        views = [(name, moment) for name, own in poses.items() for moment in own]
-        moments = sorted({moment for _, moment in views})
-        names = list(start)
-        self._moments, self._num_cameras = moments, len(names)
-        self._views = [(names.index(name), moments.index(moment)) for name, moment in views]
-        self._cameras = [cameras[name] for name in names]
-        self._sightings = [boards[name][moment] for name, moment in views]
-        T_world_boards = []
-        for moment in moments:
-            # The most certain pose of the board is its initial pose.
-            spreads = [
-                (float(np.trace(poses[name][moment].covariance)), name)
-                for name in names
-                if moment in poses[name]
-            ]
-            name = min(spreads)[1]
-            T_world_boards.append(start[name] @ poses[name][moment].T_cam_board)
-        self._transforms = np.stack([*start.values(), *T_world_boards])
+    def __init__(self, names: Sequence[str], views: Sequence[_View]) -> None:
+        start = _link_cameras(names, views)
+        self._views, self._num_cameras = views, len(names)
+        self._moments = sorted({view.moment for view in views})
+        self._cameras = [names.index(view.camera) for view in views]
+        self._boards = [self._moments.index(view.moment) for view in views]
+        # The most certain pose of the board at each moment is its initial pose.
+        best: dict[int, tuple[float, int]] = {}
+        for number, (view, board) in enumerate(zip(views, self._boards, strict=True)):
+            spread = float(np.trace(view.pose.covariance)), number
+            best[board] = min(best.get(board, spread), spread)
+        chosen = [best[board][1] for board in range(len(self._moments))]
+        boards = [start[self._cameras[k]] @ views[k].pose.T_cam_board for k in chosen]
+        self._transforms = np.stack([*start, *boards])
         self._errors = self._residuals(self._transforms)
 
     def solve(self) -> None:
         """Refine all poses by robust least squares; set ``T_world_cam`` and ``covariances``."""
         start = self._transforms
         num_unknowns = 6 * (len(start) - 1)
-        ends = np.cumsum([0, *(2 * len(detection.points) for detection in self._sightings)])
+        ends = np.cumsum([0, *(2 * len(view.detection.points) for view in self._views)])
         sparsity = lil_matrix((ends[-1], num_unknowns), dtype=np.int8)
-        for number, (camera, moment) in enumerate(self._views):
-            for unknown in (camera - 1, self._num_cameras - 1 + moment):
+        for number, (camera, board) in enumerate(zip(self._cameras, self._boards, strict=True)):
+            for unknown in (camera - 1, self._num_cameras - 1 + board):
                 if unknown >= 0:
                     sparsity[ends[number] : ends[number + 1], 6 * unknown : 6 * unknown + 6] = 1
 
@@ -222,36 +212,34 @@ class _Adjustment:
         noise = max(PIXEL_NOISE**2, squares / max(1, int(ends[-1]) - num_unknowns))
         jacobian: Any = solution.jac
         information = (jacobian.T @ jacobian).toarray()
-        num_camera = 6 * (self._num_cameras - 1)
-        whole = np.linalg.pinv(information, rcond=1e-14, hermitian=True)[:num_camera, :num_camera]
+        whole = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
         self.covariances = np.zeros((self._num_cameras, 6, 6))
         for number in range(1, self._num_cameras):
             rows = slice(6 * number - 6, 6 * number)
             self.covariances[number] = noise * whole[rows, rows]
 
     def _residuals(self, transforms: Transforms) -> list[Float[np.ndarray, "points 2"]]:
-        """Return the reprojection errors of each view in pixels; a view is a camera at a moment."""
+        """Return the reprojection errors of each view in pixels."""
         errors = []
-        for (camera, moment), detection in zip(self._views, self._sightings, strict=True):
-            T_world_board = transforms[self._num_cameras + moment]
-            points = transform(
-                invert_transform(transforms[camera]) @ T_world_board, detection.points
+        for view, camera, board in zip(self._views, self._cameras, self._boards, strict=True):
+            T_cam_board = (
+                invert_transform(transforms[camera]) @ transforms[self._num_cameras + board]
             )
-            lens = self._cameras[camera]
-            given = points, np.zeros(3), np.zeros(3), lens.K, lens.coefficients
-            errors.append(cv2.projectPoints(*given)[0][:, 0] - detection.pixels)
+            points, zero = transform(T_cam_board, view.detection.points), np.zeros(3)
+            given = points, zero, zero, view.lens.K, view.lens.coefficients
+            errors.append(cv2.projectPoints(*given)[0][:, 0] - view.detection.pixels)
         return errors
 
     def outliers(self, limit_px: float) -> list[str]:
         """Return the moments with an RMS error above ``limit_px`` and 3 times the median."""
-        errors = self._rms([moment for _, moment in self._views], len(self._moments))
+        errors = self._rms(self._boards, len(self._moments))
         limit = max(limit_px, OUTLIER * float(np.median(errors)))
         pairs = zip(self._moments, errors, strict=True)
         return [moment for moment, error in pairs if error > limit]
 
     def camera_errors_px(self) -> Float[np.ndarray, "cameras"]:
         """Return the RMS reprojection error of each camera, pixels."""
-        return self._rms([camera for camera, _ in self._views], self._num_cameras)
+        return self._rms(self._cameras, self._num_cameras)
 
     def _rms(self, groups: Sequence[int], count: int) -> Float[np.ndarray, "groups"]:
         """Return the RMS reprojection error (pixels) by group; ``groups`` has each view's group."""

@@ -15,30 +15,25 @@ from dopepp.geometry.rotation import Vector, nearest_rotation
 from dopepp.robot.calibration.board import Board
 
 MIN_POSES: Final = 4
-
-MAX_AMPLIFICATION: Final = 6.0
-"""Largest ratio of the tip's error to a pose's error; about 25° between the farthest poses."""
-
+MAX_AMPLIFICATION: Final = 6.0  # of a pose's error in the tip: 25° between the farthest poses
 MAX_RESIDUAL: Final = 0.002  # largest distance of a touched point from the fit, metres
 
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """Position of a tool's tip on the robot's flange, and its errors."""
+    """Position of a tool's tip in the flange's frame, and its errors, metres."""
 
-    position: Vector  # in the flange's frame, metres
-    residuals: Float[np.ndarray, "poses"]  # distance of the tip from the fixed point, metres
-    deviations: Vector  # standard deviations of the position along the flange's axes, metres
+    position: Vector
+    residuals: Float[np.ndarray, "poses"]  # distance of the tip from the fixed point
+    deviations: Vector  # standard deviations along the flange's axes
     findings: tuple[str, ...]  # reasons not to trust the tip, with remedies
 
 
 def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     """Estimate the position of a tool's tip from poses in which the tip touches a fixed point.
 
-    The tip p (flange frame) and the point q (base frame) solve R_i p + t_i = q for all poses i.
-
-    Args:
-        T_base_flange: Poses (R_i, t_i) of the flange in the robot's base frame, metres.
+    The tip p (flange frame) and the point q (base frame) solve R_i p + t_i = q for all poses
+    T_base_flange = (R_i, t_i), metres.
 
     Raises:
         UserError: There are fewer than four poses.
@@ -86,10 +81,7 @@ class Bench:
 
 
 def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
-    """Fit a plane to points of the bench that a tool touched.
-
-    Args:
-        touched: Points in the robot's base frame, metres. The normal points along the base's +z.
+    """Fit a plane, with z upwards, to touched points in the robot's base frame, metres.
 
     Raises:
         UserError: There are fewer than three points, or they almost lie on a line.
@@ -123,15 +115,11 @@ def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
 
 
 def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
-    """Estimate the frame of the bench from a board that lies flat on it.
+    """Estimate the frame of the bench from the pose in each image of a board that lies on it.
 
     The bench frame has the board's origin and x axis; its z axis points out of the board. A
     residual is the distance along z between the board's centre in an image and the mean of all
     images.
-
-    Args:
-        T_base_board: Pose of the board in the robot's base frame in each image, metres.
-        board: The board that lies on the bench.
 
     Raises:
         UserError: There is no pose.

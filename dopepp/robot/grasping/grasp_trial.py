@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -41,13 +41,12 @@ from dopepp.robot.grasping.rehearsal import (
     downward_view,
     draw_robot,
 )
-from dopepp.robot.grasping.selection import EstimatedPart, choose_part
-from dopepp.robot.grasping.viewpoint import choose_viewpoint
+from dopepp.robot.grasping.selection import EstimatedPart, choose_part, choose_viewpoint
 from dopepp.robot.grasping.workbench import (
     Layout,
     MujocoView,
     Photographer,
-    PlacedSolid,
+    PlacedBody,
     RasterView,
 )
 
@@ -63,13 +62,9 @@ EXACT: Final = "exact poses"
 FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
 
 DEFAULT_DISTANCE: Final = (0.18, 0.22)  # distances of the camera without a trained range, metres
-TILT: Final = np.radians(17.0)
-"""Largest rotation of the camera about its x and y axes from straight down, radians."""
-
+TILT: Final = np.radians(17.0)  # of the camera about its x and y axes from straight down
 DISTANCE_MARGIN: Final = 1.2  # factor on camera distances, for parts off the tray's centre
-FLAT_TILT_DEG: Final = 60.0
-"""Largest tilt of templates for flat parts: the camera's tilt plus the effect of perspective."""
-
+FLAT_TILT_DEG: Final = 60.0  # of templates for flat parts: TILT plus the effect of perspective
 SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 0.4}
 MAX_OBSTACLES: Final = 8  # number of parts in the planner's model
 EXTRA_ATTEMPTS: Final = 3  # number of attempts at a heap beyond its number of parts
@@ -82,8 +77,7 @@ class PoseSource:
 
     kind: str = "network"  # `network`, `templates`, `exact` (the simulation's) or `random`
     matrices: str = "calibrated"  # `calibrated` or `true` camera matrices for the network's poses
-    # Errors of exact poses in a random direction and about a random axis, millimetres and degrees.
-    error: tuple[float, float] = (0.0, 0.0)
+    error: tuple[float, float] = (0.0, 0.0)  # of exact poses in random directions, mm and degrees
 
     @property
     def name(self) -> str:
@@ -119,13 +113,12 @@ class Record:
     number: int  # index of the trial, from 0; equal indices have equal scenes
     source: str  # name of the pose source
     off: float  # error added to an exact pose, millimetres and degrees
-    seen: bool  # whether the pose source returned a pose
+    seen: bool  # whether the pose source returned a pose; if not, errors are NaN
     recognised: bool  # whether ADD was below a tenth of the part's diameter
-    # Errors are in the arm's base frame, include calibration errors, and are measured before the
-    # pose is aligned with the bench. Without a pose, errors are NaN.
-    add_mm: float  # ADD, millimetres
-    error_mm: float  # position error of the part's origin, millimetres
-    error_deg: float  # rotation error of the pose, degrees
+    # Errors include calibration errors, and are measured before the alignment with the bench.
+    add_mm: float  # ADD
+    error_mm: float  # of the part's origin
+    error_deg: float
     caught: bool  # whether the gripper held the part after lifting and shaking
     failure: str  # one of `FAILURES`, or empty
     hand_eye_mm: float  # position error by the hand-eye calibration at the parts' distance
@@ -141,7 +134,7 @@ class SceneObservation:
     """Parts that the controller detected, and the arm's joints at the last image."""
 
     parts: list[EstimatedPart]  # sorted by descending height
-    joints: Joints  # joints of the arm at the last image, radians
+    joints: Joints
     second_view: str = ""  # as in :class:`Record`
 
 
@@ -152,7 +145,7 @@ class TrialScene:
     number: int  # index of the trial
     attempt: int  # number of the attempt, from 1
     cell: Cell
-    placed: Sequence[PlacedSolid]  # objects before they settle, the parts first
+    placed: Sequence[PlacedBody]  # objects before they settle, the parts first
     start: Any  # state of the MuJoCo simulation before the grasp
     poses: list[Transform]  # T_base_obj of every object at rest
     robot: TrueRobot
@@ -160,9 +153,8 @@ class TrialScene:
     joints: Joints  # measured joint angles at the time of the image, radians
     T_base_cam: Transform  # the true pose of the camera
     image: RGBImage
-    photograph: Photographer  # renders images of the scene from other camera poses
-    # Returns the photograph function for other poses of the objects, with the same light.
-    arrange: Callable[[Sequence[Transform]], Photographer]
+    photograph: Photographer
+    arrange: Callable[[Sequence[Transform]], Photographer]  # for other poses in the same light
     taken: frozenset[int] = frozenset()  # indices of the objects that earlier attempts lifted
 
     @property
@@ -202,25 +194,24 @@ class Trials:
         self._symmetries = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         self._raster = RasterView(task.renderer == "raster-shadows")
         self.robot = cache(self._robot)
-        self._parts_cell = cache(lambda count: Cell([self.layout.solid] * count))
-        self._parts_view = cache(lambda count: MujocoView([self.layout.solid] * count))
+        # Scenes of equal numbers of parts share their models.
+        self._cell = lru_cache(8)(lambda *bodies: Cell(bodies))
+        self._mujoco = lru_cache(8)(lambda *bodies: MujocoView(bodies))
 
     @cached_property
     def estimator(self) -> PoseEstimator:
-        """The task's network, with refinement if the task asks for it."""
+        """The task's network."""
         from dopepp.inference.estimator import PoseEstimator
 
         assert self.task.network is not None
-        refine = "region" if self.task.refine else None
-        return PoseEstimator.load(self.task.network, refine=refine)
+        return PoseEstimator.load(self.task.network, refine="region" if self.task.refine else None)
 
     @cached_property
     def templates(self) -> PoseEstimator:
         """Estimator that compares the image with templates of the part's mesh, without training."""
         from dopepp.inference.estimator import PoseEstimator
 
-        near, far = self.distance
-        distances = near / DISTANCE_MARGIN, far * DISTANCE_MARGIN
+        distances = self.distance[0] / DISTANCE_MARGIN, self.distance[1] * DISTANCE_MARGIN
         lies_flat = self.task.rest == "front" and self.task.layout != "heap"
         tilt_deg = FLAT_TILT_DEG if lies_flat else 180.0
         return PoseEstimator.from_mesh(self.task.part, self.task.unit, distances, tilt_deg)
@@ -239,7 +230,7 @@ class Trials:
         return near + 0.4 * (far - near), near + 0.75 * (far - near)
 
     def _robot(self, block: int) -> tuple[TrueRobot, CalibratedRobot]:
-        """Sample the errors of the robot for a block of :data:`BLOCK` trials, and calibrate it."""
+        """Sample the errors of the robot for a block of trials, and calibrate it."""
         rng = np.random.default_rng([self.task.seed, block, 1])
         robot = draw_robot(rng, self.tip)
         return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
@@ -249,19 +240,15 @@ class Trials:
         rng = np.random.default_rng([self.task.seed, number])
         robot, calibrated = self.robot(number // BLOCK)
         placed = self.layout.draw(rng)
-        # Models and renderers of scenes with parts only are cached.
-        is_parts_only = all(item.body.part is not None for item in placed)
-        solids, count = [item.solid for item in placed], len(placed)
-        cell = self._parts_cell(count) if is_parts_only else Cell(solids)
+        bodies = [item.body for item in placed]
+        cell = self._cell(*bodies)
         state = cell.data()
         for index, item in enumerate(placed):
             cell.put(state, index, item.T_base_obj)
         joints, T_base_cam = self._aim_camera(robot, rng)
         poses = self._settle(cell, state, robot, joints)
-        view: RasterView | MujocoView = self._raster
-        if self.task.renderer == "mujoco":
-            view = self._parts_view(count) if is_parts_only else MujocoView(solids)
-        bodies, appearance = [item.body for item in placed], deepcopy(rng)
+        view = self._mujoco(*bodies) if self.task.renderer == "mujoco" else self._raster
+        appearance = deepcopy(rng)
 
         def arrange(poses: Sequence[Transform]) -> Photographer:
             return view.arrange(bodies, poses, T_base_cam, deepcopy(appearance))
@@ -281,11 +268,10 @@ class Trials:
         """Yield the attempts of a trial: one, or for a heap as many as it takes to empty the heap.
 
         A heap gets at most :data:`EXTRA_ATTEMPTS` more attempts than it has parts, and is given up
-        when two successive attempts find no plan. Before each attempt the camera takes a new image.
+        when two successive attempts find no plan.
         """
         limit = len(scene.parts) + EXTRA_ATTEMPTS if self.task.layout == "heap" else 1
-        failed: list[Transform] = []
-        failure = ""
+        failed, failure = list[Transform](), ""
         while True:
             attempt = self.attempt(scene, source, failed)
             yield attempt
@@ -310,16 +296,10 @@ class Trials:
         joints, T_base_cam = self._aim_camera(scene.robot, rng)
         poses = self._settle(scene.cell, state, scene.robot, joints)
         photograph = scene.arrange(poses)
+        image, taken = photograph(T_base_cam, rng), scene.taken.union(lifted)
+        scene = replace(scene, attempt=scene.attempt + 1, start=state, poses=poses, taken=taken)
         return replace(
-            scene,
-            attempt=scene.attempt + 1,
-            start=state,
-            poses=poses,
-            joints=joints,
-            T_base_cam=T_base_cam,
-            image=photograph(T_base_cam, rng),
-            photograph=photograph,
-            taken=scene.taken.union(lifted),
+            scene, joints=joints, T_base_cam=T_base_cam, image=image, photograph=photograph
         )
 
     def attempt(
@@ -333,17 +313,17 @@ class Trials:
         if not observation.parts:
             return Attempt(scene, self._record(scene, source, observation, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        parts = observation.parts[:MAX_OBSTACLES]
+        parts, joints = observation.parts[:MAX_OBSTACLES], observation.joints
         low = LOW[self.task.layout]
         poses = (align_with_bench(part.T_base_obj, hull, bench, low) for part in parts)
         flat = [replace(part, T_base_obj=pose) for part, pose in zip(parts, poses, strict=True)]
-        planner, joints = self._planner(scene), observation.joints
+        planner = self._planner(scene)
         choice = choose_part(planner, flat, self.part.points, self.grasps, joints, failed)
+        estimate = parts[choice.number if choice else 0].T_base_obj
         if choice is None:
-            estimate = parts[0].T_base_obj
             record = self._record(scene, source, observation, estimate, None)
             return Attempt(scene, record, estimate=estimate)
-        estimate, state = parts[choice.number].T_base_obj, copy(scene.start)
+        state = copy(scene.start)
         execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
         if observation.second_view:
             execution.move(np.stack([scene.joints, joints]))
@@ -354,8 +334,8 @@ class Trials:
     def _planner(self, scene: TrialScene) -> Planner:
         count = 1 if self.task.layout == "single" else MAX_OBSTACLES
         tilts = TILTS.tolist() if self.task.layout == "heap" else [0.0]
-        knowledge = scene.calibrated.knowledge
-        return Planner(self.arm, self.gripper, self._parts_cell(count), knowledge, tilts)
+        cell = self._cell(*[self.layout.body] * count)
+        return Planner(self.arm, self.gripper, cell, scene.calibrated.knowledge, tilts)
 
     def _observe(self, scene: TrialScene, source: PoseSource) -> SceneObservation:
         """Return the parts detected by a source, which takes one or two images if needed."""
@@ -368,14 +348,10 @@ class Trials:
         estimator = self.templates if source.kind == "templates" else self.estimator
         lens, T_base_cam = scene.calibrated.camera, self._camera_pose(scene, source, scene.joints)
         if self.task.views == 1:
-            detections = estimator.predict(scene.image, lens.K, lens.coefficients)
-            parts = [
-                EstimatedPart(
-                    T_base_cam @ item.T_cam_obj,
-                    item.score if item.probability is None else item.probability,
-                )
-                for item in self._likely(detections)
-            ]
+            likely_parts = self._likely(estimator.predict(scene.image, lens.K, lens.coefficients))
+            chances = [p.score if p.probability is None else p.probability for p in likely_parts]
+            seen = [T_base_cam @ part.T_cam_obj for part in likely_parts]
+            parts = [EstimatedPart(*pair) for pair in zip(seen, chances, strict=True)]
             return SceneObservation(_by_height(parts), scene.joints)
         result = estimator.predict_views([scene.image], [lens], [T_base_cam])
         likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
@@ -422,8 +398,8 @@ class Trials:
         counts: dict[str, Any] = {"attempt": scene.attempt, "parts": len(scene.parts)}
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
-            nan = float("nan")
-            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends, **counts)
+            nans = [float("nan")] * 3
+            return Record(*trial, False, False, *nans, False, "not seen", *ends, **counts)
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))

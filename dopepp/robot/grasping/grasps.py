@@ -20,12 +20,13 @@ close to the centre of mass.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
@@ -43,38 +44,26 @@ CLEARANCE: Final = 0.006  # preferred distance of each descending finger from th
 PAD_HALF: Final = np.array([0.004, 0.011, 0.009375])
 """Half the thickness, width and length of a finger pad, metres. A finger has two pads in a row."""
 
+# Distances of the pads' ends beyond a grasp's point, metres: half a pad, or less above an obstacle.
 INSERTIONS: Final = (0.009, 0.003, 0.0015)
-"""Distances of the pads' ends beyond a grasp's point, metres: half a pad, or less above an
-obstacle."""
-
 ABOVE_BENCH: Final = 0.001  # smallest distance of the pads' ends from the bench, metres
 PAIRS: Final = 1500  # sampled points for the search of pairs
 FACES: Final = 8  # number of the most common resting faces
 TRIED: Final = 100  # largest number of pairs that are tested on a face
 SAMPLES: Final = 5000  # points that represent the surface in tests of collisions and contacts
 THINNEST: Final = 0.002  # smallest width of a grasp, metres
-FRICTION_ANGLE: Final = math.radians(15.0)
-"""Largest angle between the normals and the closing direction; friction 0.6 holds up to 31°."""
-
-STEEPEST_CLOSING: Final = math.sin(math.radians(37.0))
-"""Largest vertical component of a closing direction."""
-
-TILTS: Final = np.radians([0.0, 25.0, -25.0])
-"""Tilts of an approach from straight down, about the closing direction, radians."""
-
+FRICTION_ANGLE: Final = math.radians(15.0)  # of normals to the closing; friction 0.6 holds 31°
+STEEPEST_CLOSING: Final = math.sin(math.radians(37.0))  # vertical component of a closing direction
+TILTS: Final = np.radians([0.0, 25.0, -25.0])  # of an approach about the closing direction
 ENOUGH: Final = 80e-6  # contact area of a pad for the full score (a fifth of the pad), m²
 LEAST: Final = 12e-6  # smallest contact area of each pad, m²
 FINGER: Final = 0.025  # thickness of a finger behind its pad, metres
+# Opposite corners of the gripper body's box, tool axes, relative to the pads' ends, metres.
 PALM: Final = np.array([[-0.075, -0.04, -0.16], [0.075, 0.04, -0.055]])
-"""Opposite corners of the gripper body's box, tool axes, relative to the pads' ends, metres."""
-
 FLAT: Final = math.cos(FRICTION_ANGLE)
-APART: Final = (0.008, math.radians(20.0))
-"""Smallest distance (metres) or angle (radians) between distinct grasps of a face."""
-
-_BUILT_IN: Final = Path(__file__).parent / "data"
+APART: Final = (0.008, math.radians(20.0))  # metres or radians between distinct grasps of a face
+BUILT_IN: Final = Path(__file__).parent / "data"
 Points = Float[np.ndarray, "n 3"]
-
 FIX: Final = "correct the file, or create a new file with `dopepp grasp propose`"
 
 
@@ -104,7 +93,7 @@ def find_grasps(part: Part, path: Path | None = None) -> tuple[Grasp, ...]:
     Raises:
         UserError: The file is invalid or of another part, or the part has no built-in file.
     """
-    built_in = _BUILT_IN / f"{part.name}.yaml"
+    built_in = BUILT_IN / f"{part.name}.yaml"
     if path is None and not built_in.is_file():
         raise UserError(
             f"part {part.name} without a grasp",
@@ -134,11 +123,7 @@ class _GraspFile:
 
 
 def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
-    """Read a YAML file of grasps.
-
-    Raises:
-        UserError: The file is invalid, or of another part.
-    """
+    """Read a YAML file of grasps; raise a ``UserError`` if it is invalid or of another part."""
     content = parse(_GraspFile, read_yaml(path), str(path), FIX)
     if content.part != part.name:
         raise UserError(f"{path}, part: {content.part!r:.100}", f"part: {part.name}", FIX)
@@ -169,29 +154,21 @@ def _check_grasp(record: _GraspRecord, name: str, part: Part) -> Grasp:
 def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
     """Write grasps to a YAML file, one per line."""
     check_target(path, (".yaml", ".yml"))
+
+    def text(numbers: Iterable[float]) -> str:
+        # YAML reads an exponent as text, and −0 becomes 0.
+        return ", ".join(f"{round(x, 5) + 0.0:.5f}".rstrip("0").rstrip(".") for x in numbers)
+
     lines = [f"part: {part.name}", "grasps:"]
     for grasp in grasps:
-        vectors = ", ".join(
-            f"{name}: [{', '.join(map(_format_number, getattr(grasp, name)))}]"
-            for name in ("point", "closing", "approach")
-        )
-        lines.append(f"- {{{vectors}, width: {_format_number(grasp.width)}}}")
+        names = ("point", "closing", "approach")
+        vectors = ", ".join(f"{name}: [{text(getattr(grasp, name))}]" for name in names)
+        lines.append(f"- {{{vectors}, width: {text([grasp.width])}}}")
     write_file(path, ("\n".join(lines) + "\n").encode())
 
 
-def _format_number(value: float) -> str:
-    """Format a number with up to five decimals, because YAML reads an exponent as text."""
-    number = round(value, 5) + 0.0  # −0 becomes 0
-    return f"{number:.5f}".rstrip("0").rstrip(".")
-
-
 def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
-    """Propose grasps from above for the stable faces on which a part can rest.
-
-    Args:
-        part: A part with a mesh.
-        count: Maximum number of grasps.
-        seed: Random seed of the sampled surface points.
+    """Propose at most ``count`` grasps from above for the stable faces on which a part can rest.
 
     Returns:
         Grasps by resting face, the most common face first; of each face, the best grasp first.
@@ -234,14 +211,9 @@ def _sample_surface(
     mesh: Mesh, count: int, rng: np.random.Generator
 ) -> tuple[Points, Points, float]:
     """Return ``count`` uniform random surface points, their unit normals, and m² per point."""
-    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
-    normals = np.cross(b - a, c - a)
-    areas = np.linalg.norm(normals, axis=1) / 2
-    chosen = rng.choice(len(areas), count, p=areas / areas.sum())
-    u, v = rng.random((2, count))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    points = a[chosen] + u[:, None] * (b - a)[chosen] + v[:, None] * (c - a)[chosen]
-    return points, normals[chosen] / (2 * areas[chosen, None]), float(areas.sum()) / count
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    points, faces = trimesh.sample.sample_surface(solid, count, seed=rng)
+    return np.asarray(points), solid.face_normals[faces], float(solid.area) / count
 
 
 def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vector, float]]:
@@ -294,8 +266,7 @@ def _score(
 ) -> float:
     """Return a grasp's score (at most 1), or 0 if the gripper collides or has too little contact.
 
-    ``up`` points upwards in the part's frame, ``bottom`` is the bench's height along it (metres),
-    ``surface`` comes from :func:`_sample_surface`, and ``centre`` is the centre of mass.
+    ``bottom`` is the bench's height along ``up``, and ``centre`` the centre of mass, metres.
     """
     points, normals, area = surface
     T = grasp.T_obj_tool(flipped=False)

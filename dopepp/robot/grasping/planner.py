@@ -23,19 +23,15 @@ from dopepp.robot.grasping.cell import FLANGE, HOME, JOINTS, Cell
 from dopepp.robot.grasping.grasps import ABOVE_BENCH, INSERTIONS, PAD_HALF, Grasp
 from dopepp.virtual.body import Hull
 
-Joints = Float[np.ndarray, "6"]
-"""Angles of the arm's joints, radians."""
-
+Joints = Float[np.ndarray, "6"]  # angles of the arm's joints, radians
 Path = Float[np.ndarray, "waypoints 6"]  # joint angles, radians
-
 POSITION_TOLERANCE: Final = 1e-4  # metres
 ANGLE_TOLERANCE: Final = 1e-3  # radians
 STEPS: Final = 60  # iterations of inverse kinematics; a reachable pose needs about ten
 COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # gripper commands, open to closed
+# Largest estimated height above the bench of a part that lies on it, by layout, metres. In a heap,
+# a part that leans on another part is not much higher.
 LOW: Final = {"single": 0.005, "distractors": 0.005, "heap": 0.002}
-"""Largest estimated height above the bench of a part that lies on it, by layout, metres. In a heap,
-a part that leans on another part is not much higher."""
-
 STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
 RETREAT: Final = 0.06  # length of the straight descent, metres
 LIFT: Final = 0.12  # height of the lift, metres
@@ -63,14 +59,14 @@ class Arm:
         return self._cell.flange_pose(self._configuration.data)
 
     def joints(self, T_base_flange: Transform, near: Joints = HOME) -> Joints | None:
-        """Return joint angles at which the flange is at a pose, or None if none are found.
-
-        The search takes at most :data:`STEPS` steps from ``near``, within the joints' limits.
-        """
+        """Return joint angles, searched from ``near``, with the flange at a pose; None if none."""
         self._configuration.update(np.array(near))
         self._task.set_target(mink.SE3.from_matrix(T_base_flange))
         for _ in range(STEPS):
-            if self._has_reached(T_base_flange):
+            current = self._cell.flange_pose(self._configuration.data)
+            shift = np.linalg.norm(current[:3, 3] - T_base_flange[:3, 3])
+            angle = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
+            if shift < POSITION_TOLERANCE and angle < ANGLE_TOLERANCE:
                 return np.array(self._configuration.q[:JOINTS])
             velocity = mink.solve_ik(
                 self._configuration, [self._task], 1.0, "daqp", limits=self._limits, damping=1e-6
@@ -78,38 +74,30 @@ class Arm:
             self._configuration.integrate_inplace(np.clip(velocity, -0.5, 0.5), 1.0)
         return None
 
-    def _has_reached(self, T_base_flange: Transform) -> bool:
-        """Return whether the flange is within 0.1 mm and 1 mrad of a pose at the current joints."""
-        current = self._cell.flange_pose(self._configuration.data)
-        shift = np.linalg.norm(current[:3, 3] - T_base_flange[:3, 3])
-        angle = rotation_angle(current[:3, :3].T @ T_base_flange[:3, :3])
-        return bool(shift < POSITION_TOLERANCE and angle < ANGLE_TOLERANCE)
-
 
 @dataclass(frozen=True, eq=False)
 class Gripper:
-    """Kinematics of the gripper's fingers, tabulated by :data:`COMMANDS`."""
+    """Kinematics of the gripper's fingers, tabulated by :data:`COMMANDS`; metres and radians."""
 
-    widths: Float[np.ndarray, "commands"]  # distance between the pads, metres, descending
-    # Distance of the pads' ends from the flange, metres. Closing fingers swing forward.
-    reaches: Float[np.ndarray, "commands"]
-    joints: Float[np.ndarray, "commands 8"]  # finger joints per gripper command
+    widths: Float[np.ndarray, "commands"]  # distance between the pads, descending
+    reaches: Float[np.ndarray, "commands"]  # from flange to pads' ends: fingers swing forward
+    joints: Float[np.ndarray, "commands 8"]
 
     @property
     def widest(self) -> float:
-        """Largest distance between the pads, metres."""
+        """Largest distance between the pads."""
         return float(self.widths[0])
 
     def command(self, width: float) -> float:
-        """Return the command (0 open, 255 closed) at which the pads are ``width`` metres apart."""
+        """Return the command (0 open, 255 closed) at which the pads are ``width`` apart."""
         return float(np.interp(-width, -self.widths, COMMANDS))
 
     def reach(self, width: float) -> float:
-        """Return the distance from flange to pads' ends while the pads are ``width`` apart, m."""
+        """Return the distance from flange to pads' ends while the pads are ``width`` apart."""
         return float(np.interp(-width, -self.widths, self.reaches))
 
     def fingers(self, width: float) -> Float[np.ndarray, "8"]:
-        """Return MuJoCo's finger joint angles, rad, while the pads are ``width`` metres apart."""
+        """Return MuJoCo's finger joint angles while the pads are ``width`` apart."""
         command = self.command(width)
         return np.array([np.interp(command, COMMANDS, joint) for joint in self.joints.T])
 
@@ -149,7 +137,7 @@ class Plan:
     descent: Path  # along the grasp's approach direction to the part
     lift: Path  # along the bench's normal
     opening: float  # distance between the fingers before they close, metres
-    grasp: Grasp  # grasp that the motion executes
+    grasp: Grasp
     quality: float  # in (0, 1]; 1 for a level, free part and much room for the fingers
 
 
@@ -181,13 +169,9 @@ def align_with_bench(
 class Planner:
     """Planner of collision-free arm motions for grasps.
 
-    Args:
-        arm: Kinematics of the arm.
-        gripper: Kinematics of the gripper.
-        cell: Model for collision checks, with at least as many parts as the plans consider.
-        knowledge: Calibrated poses of the camera, the tool tip and the bench.
-        tilts: Rotations of the hand about the closing direction, radians. Later rotations are tried
-            if no grasp is feasible with the earlier ones.
+    ``cell`` is the model for collision checks, with at least as many parts as the plans consider.
+    ``tilts`` are rotations of the hand about the closing direction, radians. Later rotations are
+    tried if no grasp is feasible with the earlier rotations.
     """
 
     def __init__(
@@ -207,12 +191,7 @@ class Planner:
     def plan(
         self, poses: Sequence[Transform], grasps: Sequence[Grasp], start: Joints
     ) -> Plan | None:
-        """Plan a motion that grasps the first of several parts.
-
-        Args:
-            poses: Poses T_base_obj of parts; the first is the part to grasp.
-            grasps: The part's grasps, the best first.
-            start: Current joint angles of the arm.
+        """Plan a motion from joint angles that grasps the first of several parts at T_base_obj.
 
         Returns:
             The motion of the first grasp that is reachable, and with which the hand approaches,
@@ -233,12 +212,11 @@ class Planner:
         return self._is_free(np.stack([start, end]), self._gripper.widest)
 
     def _place(self, poses: Sequence[Transform]) -> None:
-        """Place the model's parts at poses T_base_obj, and surplus parts away from the bench."""
+        """Place as many of the model's parts as possible at T_base_obj, and put others away."""
         for number in range(self._cell.count):
-            if number < len(poses):
-                self._cell.put(self._state, number, poses[number])
-            else:
-                self._cell.put_away(self._state, number)
+            self._cell.put_away(self._state, number)
+        for number, pose in enumerate(poses[: self._cell.count]):
+            self._cell.put(self._state, number, pose)
 
     def _tools(
         self, T_base_obj: Transform, grasp: Grasp, tilt: float, insertion: float
@@ -250,11 +228,11 @@ class Planner:
         touches the bench.
         """
         up = self.knowledge.T_base_bench[:3, 2]
-        half_width, half_pad = grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1]
-        signs = [[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
-        ends = np.array(signs) * [half_width, half_pad, 0.0]
+        signs = np.array(list(product((-1, 1), (-1, 1), [0])))
+        ends = signs * [grasp.width / 2 + 2 * PAD_HALF[0], PAD_HALF[1], 0.0]
+        R_tilt = rotation_vector_to_matrix(np.array([tilt, 0.0, 0.0]))
         for flipped in (False, True):
-            T = T_base_obj @ grasp.T_obj_tool(flipped) @ _rotation_x(tilt)
+            T = T_base_obj @ grasp.T_obj_tool(flipped) @ make_transform(R_tilt, np.zeros(3))
             steep = -float(T[:3, 2] @ up)
             if steep < np.cos(STEEPEST):
                 continue
@@ -276,24 +254,19 @@ class Planner:
         at_part = self.arm.joints(T_base_flange, start)
         if at_part is None or not self._can_close(at_part, grasp):
             return None
-        before = T_base_flange.copy()
+        before, above = T_base_flange.copy(), T_base_flange.copy()
         before[:3, 3] -= RETREAT * T_base_flange[:3, 2]
+        above[:3, 3] += LIFT * up
         first = self.arm.joints(before, start)
-        if first is None:
-            return None
-        descent = self._line(first, before, T_base_flange)
+        descent = None if first is None else self._line(first, before, T_base_flange)
         if descent is None or not self._is_free(descent, grasp.opening):
             return None
-        approach = np.stack([start, first])
+        approach = np.stack([start, descent[0]])
         if not self._is_free(approach, grasp.opening):
             return None
-        above = T_base_flange.copy()
-        above[:3, 3] += LIFT * up
         lift = self._line(descent[-1], T_base_flange, above)
-        if lift is None:
-            return None
-        freedom = self._lift_freedom(lift, grasp.width, T_base_obj)
-        if freedom == 0:
+        freedom = 0.0 if lift is None else self._lift_freedom(lift, grasp.width, T_base_obj)
+        if lift is None or not freedom:
             return None
         steep, level = -float(T_base_tool[:3, 2] @ up), 1 - float(T_base_tool[:3, 0] @ up) ** 2
         quality = steep * level * freedom * self._margin(T_base_flange, at_part, grasp)
@@ -301,15 +274,13 @@ class Planner:
 
     def _can_close(self, joints: Joints, grasp: Grasp) -> bool:
         """Return whether the hand is free at a grasp, open and when the fingers touch the part."""
-        if self._collides(joints, grasp.opening):
-            return False
-        return not self._collides(joints, grasp.width, carries=True)
+        is_blocked = self._collides(joints, grasp.opening)
+        return not (is_blocked or self._collides(joints, grasp.width, carries=True))
 
     def _lift_freedom(self, path: Path, width: float, T_base_obj: Transform) -> float:
-        """Return how freely the model's first part, now at ``T_base_obj``, can be lifted.
+        """Return how freely the first part can be lifted from ``T_base_obj`` along a path.
 
-        Returns:
-            0 if the hand hits an object, :data:`DISTURBING` if the part does, else 1.
+        The result is 0 if the hand hits an object, :data:`DISTURBING` if the part does, else 1.
         """
         T_flange_obj = np.linalg.inv(self.arm.flange(path[0])) @ T_base_obj
         shares = np.linspace(0, len(path) - 1, LIFT_CHECKS)[1:]
@@ -355,7 +326,7 @@ class Planner:
         return True
 
     def _collides(self, joints: Joints, opening: float, carries: bool = False) -> bool:
-        """Return whether the robot collides at joint angles with the pads ``opening`` apart.
+        """Return whether the robot collides with the pads ``opening`` apart.
 
         If the hand ``carries`` the first part, it may touch this part.
         """
@@ -378,8 +349,3 @@ class Planner:
         is_part = groups == 1
         hits = is_part.any(axis=1) & ~(is_part | (groups == 0)).all(axis=1)
         return bool((hits & (contact.dist < -CARRIED)).any())
-
-
-def _rotation_x(angle: float) -> Transform:
-    """Return a rotation about x by ``angle``, radians, as a transform."""
-    return make_transform(rotation_vector_to_matrix(np.array([angle, 0.0, 0.0])), np.zeros(3))

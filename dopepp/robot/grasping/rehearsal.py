@@ -39,12 +39,9 @@ SIZE: Final[Size] = (640, 480)  # (width, height) of the camera's images, pixels
 FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))  # 60° across, as in the networks' training
 TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
+# Nominal T_flange_cam: beside the fingers, which are not in view, with z along the tool.
 MOUNT: Final = make_transform(np.eye(3), np.array([0.0, 0.09, 0.11]))
-"""Nominal T_flange_cam: beside the fingers, which are not in view, with z along the tool."""
-
-BRACKET: Final = (np.radians(1.0), 0.003)
-"""Standard deviations of the bracket's error about and along each axis, radians and metres."""
-
+BRACKET: Final = (np.radians(1.0), 0.003)  # standard deviations about and along each axis
 ZERO: Final = np.radians(0.02)  # standard deviation of a joint's zero: 0.3 mm at the flange
 TOUCH: Final = 1e-4  # standard deviation of a touched point along each axis, metres
 TOUCHES, VIEWS = 8, 15  # number of touched points per calibration, and of images of the board
@@ -63,12 +60,12 @@ class TrueRobot:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedRobot:
-    """Results of a robot's simulated calibrations, and their errors."""
+    """Results of a robot's simulated calibrations, and the errors of the hand-eye transform."""
 
     knowledge: ControllerParameters
     camera: Camera
-    hand_eye_mm: float  # shift of a point at the parts' distance by the hand-eye error, millimetres
-    hand_eye_deg: float  # rotation error of the hand-eye calibration, degrees
+    hand_eye_mm: float  # shift of a point at the parts' distance
+    hand_eye_deg: float
 
 
 def draw_robot(rng: Generator, tip: Vector) -> TrueRobot:
@@ -90,8 +87,7 @@ def calibrate(robot: TrueRobot, arm: Arm, rng: Generator, distance: float) -> Ca
     return CalibratedRobot(ControllerParameters(T_flange_cam, tip, bench), camera, *errors)
 
 
-FlangePair = tuple[Transform, Transform]
-"""T_base_flange: the true pose, and the controller's reading."""
+FlangePair = tuple[Transform, Transform]  # T_base_flange: true pose, and controller's reading
 
 
 def _move(robot: TrueRobot, arm: Arm, goal: Transform) -> FlangePair | None:
@@ -162,11 +158,8 @@ def downward_view(
 ) -> Transform:
     """Return T_base_cam of a camera above a point, with the point on its optical axis.
 
-    Args:
-        point: The point in the base's frame, metres.
-        distance: Distance of the camera from the point, metres.
-        tilt: Rotation about the camera's x and y axes from straight down, radians.
-        roll: Rotation about the camera's optical axis, radians.
+    ``tilt`` rotates about the camera's x and y axes from straight down, ``roll`` about its optical
+    axis, radians.
     """
     angle = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, roll])
     rotation = _DOWN @ angle.as_matrix()

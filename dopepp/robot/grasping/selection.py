@@ -1,26 +1,39 @@
-"""Selection of the part of a heap to grasp next.
+"""Selection of the part of a heap to grasp next, and of a second view of this part.
 
 A part is preferred if its pose is probably correct, its grasp is good, little of it lies below
 other parts, and no earlier attempt to grasp it failed.
+
+Candidates for the second view lie on rings around the part, at the distance of the first camera
+pose. The second image is taken at the candidate that the arm reaches without a collision, and that
+is expected to reduce the error of the part's pose most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from dopepp.geometry.camera import Transform, transform
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import CameraMatrix, Transform, invert_transform, transform
+from dopepp.geometry.rotation import Vector
+from dopepp.inference.refinement.outline import OutlineMesh
+from dopepp.inference.several_views.next_view import next_best_view
+from dopepp.inference.several_views.views_result import WorldDetection
+from dopepp.robot.grasping.cell import TRAY
 from dopepp.robot.grasping.grasps import Grasp, Points
 from dopepp.robot.grasping.planner import Joints, Plan, Planner
+from dopepp.robot.grasping.rehearsal import SIZE, downward_view
 
 BESIDE: Final = 0.003  # largest horizontal distance of a point above another point, metres
 ABOVE: Final = 0.002  # smallest height of a point above another point, metres
 SAME: Final = 0.01  # largest distance between two estimates of a part that has not moved, metres
 TRIED: Final = 0.3  # factor on the score of a part for each failed attempt to grasp it
+VIEW_TILTS: Final = np.radians([15.0, 25.0, 35.0])  # tilt of the camera on each ring, radians
+NUM_AZIMUTHS: Final = 8  # number of candidates on each ring
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +55,8 @@ class Choice:
 def pick_score(probability: float, graspability: float, covered: float, failures: int) -> float:
     """Return the preference for a part, from 0 to 1.
 
-    Args:
-        probability: Probability that the pose is correct.
-        graspability: Quality of the best feasible grasp, from 0 to 1.
-        covered: Share of the part's surface that lies below other parts.
-        failures: Number of failed attempts to grasp this part.
+    It depends on the probability of its pose, the quality of its best grasp, the covered share of
+    its surface, and the number of failed attempts to grasp it.
     """
     return probability * graspability * (1 - covered) * TRIED**failures
 
@@ -54,10 +64,7 @@ def pick_score(probability: float, graspability: float, covered: float, failures
 def covered_share(target: Transform, others: Sequence[Transform], points: Points) -> float:
     """Return the share of a part's surface points that lie below points of other parts.
 
-    Args:
-        target: Pose T_base_obj of the part; z of the base points upwards.
-        others: Poses of the other parts.
-        points: Points of the part's surface, object frame, metres.
+    ``target`` and ``others`` are poses T_base_obj of equal parts; z of the base points upwards.
     """
     if not others:
         return 0.0
@@ -80,34 +87,90 @@ def choose_part(
 ) -> Choice | None:
     """Return the part with the largest :func:`pick_score`, or None if no part can be grasped.
 
-    Args:
-        planner: Planner of the arm's motions.
-        parts: All detected parts.
-        points: Points of the part's surface, object frame, metres.
-        grasps: The part's grasps, the best first.
-        start: Current joint angles of the arm.
-        failed: Poses T_base_obj of parts that were not grasped in earlier attempts.
+    ``points`` are the surface of each part, and ``grasps`` its grasps, the best first. ``failed``
+    are poses T_base_obj of parts that were not grasped in earlier attempts.
     """
     poses = [part.T_base_obj for part in parts]
+    orders = [[poses[k], *poses[:k], *poses[k + 1 :]] for k in range(len(parts))]  # first to grasp
     factors = []
-    for number, part in enumerate(parts):
-        others = [*poses[:number], *poses[number + 1 :]]
-        covered = covered_share(poses[number], others, points)
-        shifts = (np.linalg.norm(pose[:3, 3] - poses[number][:3, 3]) for pose in failed)
+    for part, (pose, *others) in zip(parts, orders, strict=True):
+        shifts = (np.linalg.norm(other[:3, 3] - pose[:3, 3]) for other in failed)
         failures = sum(bool(shift < SAME) for shift in shifts)
-        factors.append((part.probability, covered, failures))
+        factors.append((part.probability, covered_share(pose, others, points), failures))
     limits = [pick_score(chance, 1.0, covered, tried) for chance, covered, tried in factors]
     best: Choice | None = None
     best_score = 0.0
     for number in sorted(range(len(parts)), key=lambda number: -limits[number]):
         if limits[number] <= best_score:
             break  # not even a perfect grasp makes this part the best
-        others = [*poses[:number], *poses[number + 1 :]]
-        plan = planner.plan([poses[number], *others], grasps, start)
-        if plan is None:
-            continue
-        probability, covered, failures = factors[number]
-        score = pick_score(probability, plan.quality, covered, failures)
-        if score > best_score:
-            best, best_score = Choice(number, plan), score
+        plan = planner.plan(orders[number], grasps, start)
+        if plan is not None and limits[number] * plan.quality > best_score:
+            best, best_score = Choice(number, plan), limits[number] * plan.quality
     return best
+
+
+class Viewpoint(NamedTuple):
+    """Joint angles at which the camera takes the second image, and the reason for this choice."""
+
+    joints: Joints  # angles that the controller reads, radians
+    reason: str
+
+
+def choose_viewpoint(
+    planner: Planner,
+    K: CameraMatrix,
+    start: Joints,
+    parts: Sequence[WorldDetection],
+    mesh: OutlineMesh,
+) -> Viewpoint | None:
+    """Return the view that is expected to reduce the pose error of the first part most.
+
+    ``start`` are the joint angles at the first image, and ``parts`` its detections in the robot's
+    base frame. Without a part, the first candidate in reach is returned. None means that the arm
+    reaches no view that shows the whole part.
+    """
+    T_base_cam = _camera_pose(planner, start)
+    middle = mesh.vertices.mean(axis=0)
+    point = transform(parts[0].T_world_obj, middle) if parts else TRAY
+    distance = float(np.linalg.norm(point - T_base_cam[:3, 3]))
+    poses = [part.T_world_obj for part in parts]
+    reached = [
+        joints
+        for joints in _candidates(planner, point, distance, start)
+        if planner.can_move(poses, start, joints)
+    ]
+    cameras = [_camera_pose(planner, joints) for joints in reached]
+    number, reason = 0, "shows the tray from another side"
+    if parts:
+        part, bench = parts[0], planner.knowledge.T_base_bench
+        given = part.T_world_obj, part.covariance, cameras, K, SIZE, bench
+        try:
+            best = next_best_view(mesh, *given)
+        except UserError:  # no candidate shows the whole part
+            return None
+        number, reason = best.number, best.reason
+    if not reached:
+        return None
+    cosine = float(T_base_cam[:3, 2] @ cameras[number][:3, 2])
+    angle = np.degrees(np.arccos(min(1.0, cosine)))
+    reason = f"{angle:.0f}° from the first, {reason}; best of {len(reached)} in reach"
+    return Viewpoint(reached[number], reason)
+
+
+def _camera_pose(planner: Planner, joints: Joints) -> Transform:
+    """Return T_base_cam by the controller's calibration, at the joint angles that it reads."""
+    return np.asarray(planner.arm.flange(joints) @ planner.knowledge.T_flange_cam)
+
+
+def _candidates(
+    planner: Planner, point: Vector, distance: float, start: Joints
+) -> Iterator[Joints]:
+    """Yield joint angles of reachable camera poses at ``distance`` (metres) around a point."""
+    T_cam_flange = invert_transform(planner.knowledge.T_flange_cam)
+    for tilt in VIEW_TILTS:
+        for azimuth in np.linspace(0.0, 2 * np.pi, NUM_AZIMUTHS, endpoint=False):
+            tilts = tilt * np.array([np.cos(azimuth), np.sin(azimuth)])
+            T_base_cam = downward_view(point, distance, tilts, 0.0)
+            joints = planner.arm.joints(T_base_cam @ T_cam_flange, start)
+            if joints is not None:
+                yield joints

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,7 +21,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
-from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell, Solid
+from dopepp.robot.grasping.cell import CAMERA, JOINTS, TRAY, Cell
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body, distractor_shapes, make_body
@@ -42,31 +42,20 @@ HEAP_TILT: Final = 15.0  # largest initial tilt of a falling part, degrees
 DISTRACTORS: Final = (2, 4)  # smallest and largest number of distractors
 DISTRACTOR_RADIUS: Final = (0.012, 0.025)  # range of a distractor's radius, metres
 DISTRACTOR_AREA: Final = 0.11  # radius within which distractors are placed, metres
-COLOUR: Final = (0.93, 0.55, 0.14)
-
-RENDERERS: Final = ("raster", "raster-shadows", "mujoco")
-"""Renderers of the camera's images: ``raster``, as in the training of the released networks, has
-a bench without shadows; ``raster-shadows`` adds the shadows of parts."""
-
-STYLE: Final = PRESETS["wide"]
-"""Preset of the released networks: light, materials and camera errors."""
-
-UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
-"""Joint angles of an arm that points upwards, outside the camera image, radians."""
+RENDERERS: Final = ("raster", "raster-shadows", "mujoco")  # training was with `raster`
+STYLE: Final = PRESETS["wide"]  # preset of the released networks: light, materials, camera errors
+UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])  # joints of an arm out of view
 
 Photographer = Callable[[Transform, Generator], RGBImage]
-"""Renders the objects at rest for a camera at T_base_cam; the generator samples the sensor's noise
-and blur."""
+"""Renders the objects at rest for a camera at T_base_cam, with sampled sensor noise and blur."""
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedSolid:
+class PlacedBody(NamedTuple):
     """An object on the bench and its pose before the simulation starts."""
 
     body: Body
-    solid: Solid
     T_base_obj: Transform
 
 
@@ -76,21 +65,18 @@ class Layout:
     Args:
         part: The part to grasp.
         name: One of :data:`LAYOUTS`.
-        yaw_deg: Largest rotation of parts about the vertical to either side, degrees. At 0, their x
-            axis points to the camera's right.
+        yaw_deg: Largest yaw to either side. At 0, a part's x axis points to the camera's right.
         rest: ``front`` lays the part's +z axis upwards; ``any`` selects a random resting face.
     """
 
     def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
         self._name = name
         self.part, self.body = part, make_body(part, is_target=True)
-        self.solid = Solid(self.body.pieces, part.mesh, COLOUR)
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
-    def draw(self, rng: Generator) -> list[PlacedSolid]:
+    def draw(self, rng: Generator) -> list[PlacedBody]:
         """Sample the objects of this layout and their poses; the parts come first."""
-        solids: list[PlacedSolid] = getattr(self, self._name)(rng)
-        return solids
+        return list(getattr(self, self._name)(rng))
 
     def draw_pose(self, rng: Generator) -> Transform:
         """Sample the pose T_base_obj of a single part in the tray."""
@@ -98,7 +84,7 @@ class Layout:
 
     def _draw_part(
         self, rng: Generator, spread: float, height: float, tilt_deg: float
-    ) -> PlacedSolid:
+    ) -> PlacedBody:
         """Sample a part's pose ≤ ``spread`` from the tray's centre, ``height`` over it, metres."""
         up = np.array([0.0, 0.0, 1.0])
         if self._rest == "any":
@@ -107,21 +93,19 @@ class Layout:
         upright = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
         yaw, azimuth = rng.uniform(-self._yaw, self._yaw), rng.uniform(0, 2 * np.pi)
         tilt = np.radians(rng.uniform(0, tilt_deg)) * np.array([np.cos(azimuth), np.sin(azimuth)])
-        orientation = (
-            Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, yaw]) * upright
-        )
-        rotation = orientation.as_matrix()
+        turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, yaw])
+        rotation = (turn * upright).as_matrix()
         lowest = float((self.body.hull.vertices @ rotation[2]).min())
         centre = rotation @ self.part.cuboid[-1]
         offset = np.array([*_draw_in_disc(rng, spread), height - lowest])
         position = TRAY + offset - [*centre[:2], 0.0]
-        return PlacedSolid(self.body, self.solid, make_transform(rotation, position))
+        return PlacedBody(self.body, make_transform(rotation, position))
 
-    def single(self, rng: Generator) -> list[PlacedSolid]:
+    def single(self, rng: Generator) -> list[PlacedBody]:
         """Sample the pose of a single part."""
         return [self._draw_part(rng, SPREAD, DROP_HEIGHT, 0.0)]
 
-    def distractors(self, rng: Generator) -> list[PlacedSolid]:
+    def distractors(self, rng: Generator) -> list[PlacedBody]:
         """Sample a part and 2 to 4 distractors whose bounding circles do not overlap."""
         solids = self.single(rng)
         occupied = [(solids[0].T_base_obj[:3, 3], self.part.diameter / 2)]
@@ -132,16 +116,16 @@ class Layout:
             body = shape.stretched(radius * rng.uniform(0.6, 1.0, 3))
             for _ in range(20):
                 position = TRAY + np.array([*_draw_in_disc(rng, DISTRACTOR_AREA), 0.0])
-                if all(
-                    np.linalg.norm((position - centre)[:2]) > radius + other
-                    for centre, other in occupied
-                ):
+                gaps = (
+                    np.linalg.norm((position - centre)[:2]) - other for centre, other in occupied
+                )
+                if min(gaps) > radius:
                     occupied.append((position, radius))
                     solids.append(_standing(body, position, rng))
                     break
         return solids
 
-    def heap(self, rng: Generator) -> list[PlacedSolid]:
+    def heap(self, rng: Generator) -> list[PlacedBody]:
         """Sample 3 to 5 parts above each other, and let them fall onto each other.
 
         Raises:
@@ -149,7 +133,7 @@ class Layout:
         """
         count = int(rng.integers(HEAP[0], HEAP[1] + 1))
         for _ in range(HEAP_TRIALS):
-            falling: list[PlacedSolid] = []
+            falling: list[PlacedBody] = []
             height = DROP_HEIGHT
             for _ in range(count):
                 falling.append(self._draw_part(rng, HEAP_SPREAD, height, HEAP_TILT))
@@ -158,20 +142,17 @@ class Layout:
             starts = np.stack([item.T_base_obj for item in falling])
             poses = settle([self.body.pieces] * count, starts, (), self.part.diameter)
             if poses is not None:
-                placed = zip(falling, poses, strict=True)
-                return [replace(item, T_base_obj=pose) for item, pose in placed]
+                return [PlacedBody(self.body, pose) for pose in poses]
         problem = f"a heap of part {self.part.name}, which does not come to rest"
         allowed = "parts that do not roll on the bench"
         raise UserError(problem, allowed, "pass --layout single or distractors")
 
 
-def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedSolid:
+def _standing(body: Body, position: np.ndarray, rng: Generator) -> PlacedBody:
     """Place a distractor upright on the bench at ``position``, metres, with a random yaw."""
     rotation = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     height = DROP_HEIGHT - float(body.surface.vertices[:, 2].min())
-    solid = Solid(body.pieces, None, (0.35, 0.45, 0.6))
-    T_base_obj = make_transform(rotation, position + np.array([0.0, 0.0, height]))
-    return PlacedSolid(body, solid, T_base_obj)
+    return PlacedBody(body, make_transform(rotation, position + np.array([0.0, 0.0, height])))
 
 
 def _draw_in_disc(rng: Generator, radius: float) -> tuple[float, float]:
@@ -197,13 +178,9 @@ class RasterView:
         T_base_cam: Transform,
         rng: Generator,
     ) -> Photographer:
-        """Sample the objects' materials, the lights and the bench's texture; return the renderer.
+        """Sample the materials of bodies at T_base_obj, the lights and the bench's texture.
 
-        Args:
-            bodies: Objects on the bench.
-            poses: T_base_obj of each object.
-            T_base_cam: Camera pose of the first image; its optical axis hits the lit point.
-            rng: Random generator of the materials, lights and texture.
+        The optical axis of the first image's camera, at ``T_base_cam``, hits the lit point.
         """
         T_cam_base = invert_transform(T_base_cam)
         objects = []
@@ -213,7 +190,10 @@ class RasterView:
             if body.part is not None:  # copies of a part have the same material
                 material = materials.setdefault(body.part.name, material)
             objects.append(SceneObject(body.surface, T_cam_base @ pose, material, body.part))
-        T_cam_table = table_pose(T_base_cam)
+        # The table's frame has the base's axes, and its origin where the optical axis meets it.
+        ahead = T_base_cam[:3, 2]
+        origin = T_base_cam[:3, 3] - T_base_cam[2, 3] / ahead[2] * ahead
+        T_cam_table = T_cam_base @ make_transform(np.eye(3), origin)
         lights, ambient = STYLE.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
         table_image = Table().draw_image(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
         background = table_image.project(TRUE_K, SIZE, T_cam_table)
@@ -224,7 +204,7 @@ class RasterView:
     def _take(
         self, scene: Scene, T_base_first: Transform, T_base_cam: Transform, rng: Generator
     ) -> RGBImage:
-        """Render a scene, defined in the first camera's frame, from another, with sensor errors."""
+        """Render a scene in the first camera's frame from another camera, with sensor errors."""
         scene = scene.seen_from(invert_transform(T_base_cam) @ T_base_first)
         scene = scene if self._shadows else replace(scene, plane=None)
         return capture(self._render(scene).image, self._sensors.draw(rng))
@@ -233,7 +213,7 @@ class RasterView:
 class MujocoView:
     """View of the bench by MuJoCo's renderer, with fixed materials; requires OpenGL."""
 
-    def __init__(self, solids: Sequence[Solid]) -> None:
+    def __init__(self, solids: Sequence[Body]) -> None:
         self._cell = Cell(solids, shown="solids")
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, SIZE)
@@ -265,13 +245,6 @@ class MujocoView:
         return capture(image, self._sensors.draw(rng))
 
 
-def table_pose(T_base_cam: Transform) -> Transform:
-    """Return T_cam_table: base axes, origin where the optical axis meets the bench plane."""
-    ahead = T_base_cam[:3, 2]
-    origin = T_base_cam[:3, 3] - T_base_cam[2, 3] / ahead[2] * ahead
-    return np.asarray(invert_transform(T_base_cam) @ make_transform(np.eye(3), origin))
-
-
 @cache
 def has_gl() -> bool:
     """Return whether MuJoCo can render images; log a warning if not."""
@@ -284,11 +257,7 @@ def has_gl() -> bool:
 
 
 def open_gl(model: Any, size: tuple[int, int]) -> Any:
-    """Return a MuJoCo renderer for images of ``size``, (width, height) in pixels.
-
-    Raises:
-        UserError: OpenGL is not available.
-    """
+    """Return a MuJoCo renderer, or raise a ``UserError`` if OpenGL is not available."""
     try:
         return mujoco.Renderer(model, size[1], size[0])
     except Exception as error:  # drivers raise many types

@@ -18,14 +18,14 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import Transform
+from dopepp.geometry.camera import Transform, make_transform, transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.pose_result import COLOURS
 from dopepp.inference.several_views.views_result import WorldDetection
 from dopepp.parts.mesh import face_areas
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.part import Part
-from dopepp.robot.nodes.worker import Answer, Posed, Stamp
+from dopepp.robot.nodes.worker import Answer, Posed
 
 MARKER_FACES: Final = 1000  # largest number of triangles of a marker; its message has 36 kB
 
@@ -75,10 +75,7 @@ class Triangles:
 
 
 class AnswerFormatter:
-    """Converts a worker's answers to ROS messages.
-
-    Args:
-        parts: Parts that the worker detects; a part without a mesh has an empty marker.
+    """Converts a worker's answers to ROS messages; a part without a mesh has an empty marker.
 
     Raises:
         UserError: Part names coincide after characters outside [A-Za-z0-9_] are replaced by _.
@@ -107,7 +104,7 @@ class AnswerFormatter:
 
     def messages(self, answer: Answer, is_wanted: Callable[[str], bool]) -> list[Message]:
         """Return the messages of an answer, for topics on which ``is_wanted`` returns true."""
-        header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
+        header = _header(answer.stamp, answer.frame_id)
         makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
             copies = [pose for pose in answer.detections if pose.object == name]
@@ -139,8 +136,8 @@ class AnswerFormatter:
         """Return ``vision_msgs/Detection3DArray`` fields, with the parts' cuboids as boxes."""
         detections = []
         for name, detection in self._frames(answer):
-            cuboid, centre = self._cuboids[detection.object], _transform(detection).copy()
-            centre[:3, 3] += centre[:3, :3] @ cuboid[-1]  # the box centre, not the part's origin
+            cuboid, T = self._cuboids[detection.object], _transform(detection)
+            centre = make_transform(T[:3, :3], transform(T, cuboid[-1]))
             box = {"center": _pose(centre), "size": _xyz(np.ptp(cuboid, axis=0))}
             results = [_hypothesis(detection)]
             detections.append({"header": header, "results": results, "bbox": box, "id": name})
@@ -151,8 +148,8 @@ class AnswerFormatter:
         transforms = []
         for name, detection in self._frames(answer):
             pose = _pose(_transform(detection))
-            transform = {"translation": pose["position"], "rotation": pose["orientation"]}
-            transforms.append({"header": header, "child_frame_id": name, "transform": transform})
+            fields = {"translation": pose["position"], "rotation": pose["orientation"]}
+            transforms.append({"header": header, "child_frame_id": name, "transform": fields})
         return {"transforms": transforms}
 
     def _markers(self, answer: Answer, header: Fields) -> Fields:
@@ -160,22 +157,15 @@ class AnswerFormatter:
         markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
         for index, detection in enumerate(answer.detections):
             red, green, blue = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
-            marker = {
-                "header": header,
-                "ns": detection.object,
-                "id": index,
-                "type": TRIANGLE_LIST,
-                "action": ADD,
-                "pose": _pose(_transform(detection)),
-                "scale": _xyz(np.ones(3)),
-                "color": {"r": red, "g": green, "b": blue, "a": 0.8},
-                "points": self._triangles[detection.object],
-            }
-            markers.append(marker)
+            identity = {"header": header, "ns": detection.object, "id": index}
+            kind = {"type": TRIANGLE_LIST, "action": ADD, "scale": _xyz(np.ones(3))}
+            pose, points = _pose(_transform(detection)), self._triangles[detection.object]
+            colour = {"r": red, "g": green, "b": blue, "a": 0.8}
+            markers.append({**identity, **kind, "pose": pose, "color": colour, "points": points})
         return {"markers": markers}
 
 
-def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> Message:
+def diagnosis(stamp: int, name: str, problem: str, values: dict[str, str]) -> Message:
     """Return the diagnostic message of a node; the level is OK if ``problem`` is empty."""
     status = {
         "level": WARN if problem else OK,
@@ -184,8 +174,12 @@ def diagnosis(stamp: Stamp, name: str, problem: str, values: dict[str, str]) -> 
         "hardware_id": "",
         "values": [{"key": key, "value": value} for key, value in values.items()],
     }
-    header = {"stamp": stamp._asdict(), "frame_id": ""}
-    return Message(*DIAGNOSTICS, {"header": header, "status": [status]})
+    return Message(*DIAGNOSTICS, {"header": _header(stamp, ""), "status": [status]})
+
+
+def _header(stamp: int, frame_id: str) -> Fields:
+    sec, nanosec = divmod(stamp, 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
 def image_fields(image: RGBImage, header: Fields) -> Fields:
@@ -198,9 +192,7 @@ def image_fields(image: RGBImage, header: Fields) -> Fields:
 
 def _transform(detection: Posed) -> Transform:
     """Return the pose of a detection in the frame of the answer."""
-    if isinstance(detection, WorldDetection):
-        return detection.T_world_obj
-    return detection.T_cam_obj
+    return detection.T_world_obj if isinstance(detection, WorldDetection) else detection.T_cam_obj
 
 
 def _hypothesis(detection: Posed) -> Fields:

@@ -1,33 +1,30 @@
 """A ROS 2 node, with the wheels of the package extra ``ros2`` or the rclpy of an installed ROS.
 
-The images of several cameras are paired by their stamps (:mod:`.pairing`) into sets.
+The images of several cameras are paired by their stamps (:mod:`.image_queue`) into sets.
 The subscription is RELIABLE unless the camera only offers best effort, which loses large messages.
-The queue is short. A camera is faster than a network, so the latest image waits in a
-:class:`Slot` while its predecessor is processed. Topics whose message types are not installed
-(``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
+The worker runs in a thread and gets the latest image through a :class:`.image_queue.Slot`. Topics
+whose message types are not installed (``vision_msgs``, ``tf2_msgs``) are skipped with a warning.
 """
 
 from __future__ import annotations
 
 import array
 import logging
-import threading
-import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform
-from dopepp.geometry.transform_file import parse_transform
+from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.rotation import quaternion_to_matrix
 from dopepp.inference.frames.ros import info_topic
+from dopepp.robot.nodes.image_queue import MAX_LAG_S, Pace, Slot, StampPairing
 from dopepp.robot.nodes.messages import (
     DIAGNOSTICS,
     OVERLAY,
@@ -37,22 +34,17 @@ from dopepp.robot.nodes.messages import (
     Triangles,
     diagnosis,
 )
-from dopepp.robot.nodes.pairing import MAX_LAG_S, StampPairing
 from dopepp.robot.nodes.views_worker import ViewsWorker
-from dopepp.robot.nodes.worker import Shot, Stamp, Worker, stamp_of
+from dopepp.robot.nodes.worker import Shot, Worker, stamp_of
 
 QUEUE_IN: Final = 5  # a shorter queue loses images on a busy machine; a longer one delays them
 QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2  # seconds between two checks whether the node should stop
-PATIENCE_S: Final = 5.0  # seconds to wait for the last image when the node stops
 SILENT_S: Final = 5  # seconds without an image before a warning
 UNPAIRED: Final = 10  # consecutive dropped sets before a warning
 CHECKPOINTS: Final = -1.0  # parameter ``confidence`` that selects the checkpoint's threshold
-RECENT: Final = 100  # number of images over which rates and latencies are reported
 
 logger = logging.getLogger(__name__)
-
-Item = TypeVar("Item")
 
 
 def run(
@@ -64,12 +56,9 @@ def run(
 ) -> None:
     """Publish the poses in the images of ROS 2 topics until the process is interrupted.
 
-    Args:
-        worker: Estimator of the poses; a :class:`ViewsWorker` for several topics.
-        topics: Topic of each camera's images.
-        name: Name of the node, which prefixes its topics.
-        params: YAML file of ROS 2 parameters.
-        max_lag_s: Largest difference of the stamps in a set of images, seconds.
+    Several topics, one of each camera, need a :class:`ViewsWorker`, and the stamps of a set of
+    images differ by at most ``max_lag_s`` seconds. ``name`` prefixes the topics of the node, and
+    ``params`` is a YAML file of ROS 2 parameters.
 
     Raises:
         UserError: A name, the file or a parameter in it is invalid.
@@ -122,11 +111,7 @@ class _Node:
     """ROS 2 node that subscribes to images and publishes the worker's poses in them."""
 
     def __init__(
-        self,
-        worker: Worker,
-        topics: Sequence[str],
-        name: str,
-        max_lag_s: float = MAX_LAG_S,
+        self, worker: Worker, topics: Sequence[str], name: str, max_lag_s: float = MAX_LAG_S
     ) -> None:
         import rclpy
 
@@ -145,8 +130,8 @@ class _Node:
         for published, kind in (*self._formatter.topics(), DIAGNOSTICS):
             self._advertise(published, kind)
         self.slot: Slot[Sequence[Shot]] = Slot(self._answer)
-        for number in range(len(topics)):
-            self._subscribe(number)
+        for camera in self._cameras:
+            self._subscribe(camera)
         self._summary, self._has_warned = "", False
         self.handle.create_timer(1.0, self._tick)
 
@@ -188,39 +173,31 @@ class _Node:
             return
         self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
-    def _subscribe(self, number: int) -> None:
+    def _subscribe(self, camera: _Camera) -> None:
         """Replace the subscriptions to a camera's images and their ``camera_info``."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-        camera = self._cameras[number]
         policy = ReliabilityPolicy.RELIABLE if camera.is_reliable else ReliabilityPolicy.BEST_EFFORT
-        compressed = camera.topic.endswith("/compressed")
-        image = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
-        info = type_of("sensor_msgs/CameraInfo")
+        image = "CompressedImage" if camera.topic.endswith("/compressed") else "Image"
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
         for subscription in camera.subscriptions:
             self.handle.destroy_subscription(subscription)
         # This order delivers the camera_info before its image.
-        handlers = {
-            info_topic(camera.topic): (info, partial(self._take_info, number)),
-            camera.topic: (image, partial(self._take_image, number)),
-        }
+        kinds = {"CameraInfo": info_topic(camera.topic), image: camera.topic}
+        takers = partial(setattr, camera, "info"), partial(self._take_image, camera)
         camera.subscriptions = [
-            self.handle.create_subscription(kind, topic, handler, qos)
-            for topic, (kind, handler) in handlers.items()
+            self.handle.create_subscription(type_of(f"sensor_msgs/{kind}"), topic, take, qos)
+            for (kind, topic), take in zip(kinds.items(), takers, strict=True)
         ]
 
-    def _take_info(self, number: int, message: Any) -> None:
-        self._cameras[number].info = message
-
-    def _take_image(self, number: int, message: Any) -> None:
+    def _take_image(self, camera: _Camera, message: Any) -> None:
         """Pass an image, or the set that it completes, to the worker's thread."""
-        camera = self._cameras[number]
         camera.received += 1
         shot = Shot(message, camera.info, camera.topic)
         shots: Sequence[Shot] | None = [shot]
         if self._pairing is not None:
-            shots = self._pairing.add(number, stamp_of(message.header.stamp).seconds, shot)
+            number = self._cameras.index(camera)
+            shots = self._pairing.add(number, stamp_of(message) / 1e9, shot)
         if shots is not None:
             self.slot.put(shots)
 
@@ -231,28 +208,27 @@ class _Node:
             return
         for message in self._formatter.messages(answer, self._is_wanted):
             self._publish(message)
-        self._pace.count(self._now() - answer.stamp.seconds)
+        self._pace.count((self._now() - answer.stamp) / 1e9)
         self._summary = answer.result.summary
 
     def _tick(self) -> None:
         """Publish the diagnostics, once a second, and check each camera."""
         self._publish(self._diagnosis())
-        for number in range(len(self._cameras)):
-            self._check_silence(number)
+        for camera in self._cameras:
+            self._check_silence(camera)
         if self._pairing_problem() and not self._has_warned:
             self._has_warned = True
             logger.warning("%s", self._pairing_problem())
 
-    def _check_silence(self, number: int) -> None:
+    def _check_silence(self, camera: _Camera) -> None:
         """If a camera has no new images, try best effort once, then warn."""
-        camera = self._cameras[number]
         is_silent = camera.received == camera.received_before
         camera.received_before = camera.received
         camera.silent_s = camera.silent_s + 1 if is_silent else 0
         if not camera.received and camera.is_reliable and self._is_best_effort(camera.topic):
             camera.is_reliable = False
             logger.warning("%s is published best effort: images may be lost", camera.topic)
-            self._subscribe(number)
+            self._subscribe(camera)
         elif camera.silent_s == SILENT_S:
             overlay, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
             topics = self.handle.get_topic_names_and_types()
@@ -286,12 +262,9 @@ class _Node:
             values |= {"sets": str(pairing.num_sets), "dropped sets": str(pairing.dropped)}
             values["lag (ms)"] = "" if pairing.lag_s is None else f"{1e3 * pairing.lag_s:.1f}"
         values["last image"] = self._summary
-        now = self._now()
-        stamp = Stamp(int(now), int(1e9 * (now % 1)))
         silences = [camera.problem for camera in self._cameras]
         problems = [self._worker.problem, *silences, self._pairing_problem()]
-        problem = next((text for text in problems if text), "")
-        return diagnosis(stamp, self._name, problem, values)
+        return diagnosis(self._now(), self._name, next(filter(None, problems), ""), values)
 
     def _is_best_effort(self, topic: str) -> bool:
         """Return whether a publisher of an image topic offers best-effort delivery only."""
@@ -313,9 +286,9 @@ class _Node:
         publisher = self._publishers.get(topic)
         return publisher is not None and publisher.get_subscription_count() > 0
 
-    def _now(self) -> float:
-        """Return the ROS clock's time, seconds (since 1970, unless time is simulated)."""
-        return float(self._clock.now().nanoseconds / 1e9)
+    def _now(self) -> int:
+        """Return the ROS clock's time, nanoseconds (since 1970, unless time is simulated)."""
+        return int(self._clock.now().nanoseconds)
 
 
 @contextmanager
@@ -329,12 +302,10 @@ def _ros_errors(source: str) -> Iterator[None]:
         raise UserError(f"{source}: {error!s:.300}", allowed, fix) from error
 
 
-def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]:
+def transform_lookup(node: Any, world: str) -> Callable[[str, int], Transform]:
     """Return a function that looks up the pose of a frame in the world in TF at a time.
 
-    Args:
-        node: Node of rclpy, which receives the transforms.
-        world: Name of the world frame.
+    ``node`` is a node of rclpy, which receives the transforms.
 
     Raises:
         UserError: ``tf2_ros`` is not installed. The function raises it if TF has no transform.
@@ -351,100 +322,19 @@ def transform_lookup(node: Any, world: str) -> Callable[[str, Stamp], Transform]
     buffer = Buffer()
     buffer.listener = TransformListener(buffer, node)  # keeps the subscriptions alive
 
-    def look_up(frame: str, stamp: Stamp) -> Transform:
-        time = Time(seconds=stamp.sec, nanoseconds=stamp.nanosec)
+    def look_up(frame: str, stamp: int) -> Transform:
+        time, wait = Time(nanoseconds=stamp), Duration(seconds=WAIT_S)
         try:
-            answer = buffer.lookup_transform(world, frame, time, Duration(seconds=WAIT_S))
+            answer = buffer.lookup_transform(world, frame, time, wait)
         except Exception as error:  # TF raises many types
             problem = f"no transform from {world} to {frame} ({error!s:.200})"
             fix = "publish it, choose another --world, or pass --views rig.yaml"
             raise UserError(problem, "the pose of each camera in TF", fix) from error
-        shift, rotation = answer.transform.translation, answer.transform.rotation
-        fields = {
-            "translation": {axis: getattr(shift, axis) for axis in "xyz"},
-            "rotation": {axis: getattr(rotation, axis) for axis in "xyzw"},
-        }
-        return parse_transform(fields, f"TF from {world} to {frame}")
+        shift, turn = answer.transform.translation, answer.transform.rotation
+        R = quaternion_to_matrix(np.array([turn.w, turn.x, turn.y, turn.z]))
+        return make_transform(R, np.array([shift.x, shift.y, shift.z]))
 
     return look_up
-
-
-class Slot(Generic[Item]):
-    """Queue of length 1 to a worker thread: a new image replaces an image that still waits.
-
-    Args:
-        handle: Function that the thread calls with each image. An exception of this function ends
-            the thread and is raised again by :meth:`put` and :meth:`check`.
-    """
-
-    def __init__(self, handle: Callable[[Item], None]) -> None:
-        self._handle = handle
-        self._item: Item | None = None
-        self._fresh, self._stopped = threading.Condition(), False
-        self._error: Exception | None = None
-        self.received = self.replaced = 0
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def put(self, item: Item) -> None:
-        """Store an image for the thread in place of a waiting image."""
-        self.check()
-        with self._fresh:
-            self.received += 1
-            self.replaced += self._item is not None
-            self._item = item
-            self._fresh.notify()
-
-    def check(self) -> None:
-        """Raise the exception that ended the thread, if any."""
-        if self._error is not None:
-            raise self._error
-
-    def stop(self) -> None:
-        """Stop the thread after its current image, for which this method waits at most 5 s."""
-        with self._fresh:
-            self._stopped = True
-            self._fresh.notify()
-        self._thread.join(PATIENCE_S)
-
-    def _run(self) -> None:
-        """Process images until :meth:`stop` is called; the thread's main function."""
-        try:
-            while True:
-                with self._fresh:
-                    self._fresh.wait_for(lambda: self._item is not None or self._stopped)
-                    item, self._item = self._item, None
-                    if item is None or self._stopped:
-                        return
-                self._handle(item)
-        except Exception as error:
-            self._error = error
-
-
-class Pace:
-    """Rate and latency of the published answers, over the last :data:`RECENT` images."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._times, self._latencies = deque[float](maxlen=RECENT), deque[float](maxlen=RECENT)
-        self._answered = 0
-
-    def count(self, latency_s: float) -> None:
-        """Record an answer; ``latency_s`` is the time since its image was captured, seconds."""
-        self._times.append(self._clock())
-        self._latencies.append(1000 * latency_s)
-        self._answered += 1
-
-    def values(self) -> dict[str, str]:
-        """Return the number of answers, their rate and their latency as texts by name and unit."""
-        values = {"answered": str(self._answered)}
-        if len(self._times) > 1:
-            span = self._times[-1] - self._times[0]
-            values["rate (1/s)"] = f"{(len(self._times) - 1) / max(span, 1e-9):.1f}"
-        if self._latencies:
-            values["latency, median (ms)"] = f"{np.median(self._latencies):.1f}"
-            values["latency, 95 % (ms)"] = f"{np.percentile(self._latencies, 95):.1f}"
-        return values
 
 
 def native(kind: str, fields: Fields) -> Any:

@@ -22,7 +22,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.frames import FrameSource
 from dopepp.inference.frames.ros import Bag
 from dopepp.robot.nodes.messages import OVERLAY, VISION, AnswerFormatter, Fields, Triangles
-from dopepp.robot.nodes.worker import Answer, Shot, Stamp, Worker, stamp_of
+from dopepp.robot.nodes.worker import Answer, Shot, Worker, stamp_of
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -38,10 +38,7 @@ def send_lines(
 ) -> None:
     """Send the poses in each image as a line of JSON, like ``dopepp predict --json``.
 
-    Args:
-        worker: Estimator of the poses.
-        sources: Sources of images, e.g. videos, with their cameras.
-        address: ``host:port`` of a UDP receiver (default: stdout).
+    ``address`` is ``host:port`` of a UDP receiver (default: stdout).
 
     Raises:
         UserError: The address is invalid, or a source cannot be read.
@@ -86,11 +83,7 @@ def _print(line: str) -> None:
 
 
 def _parse_address(text: str) -> tuple[str, int]:
-    """Return the IP address and port of ``host:port``.
-
-    Raises:
-        UserError: The text has another form, or the host is unknown.
-    """
+    """Return the IP address and port of ``host:port``, or raise a ``UserError``."""
     host, _, port = text.rpartition(":")
     try:
         if not host or not 0 < int(port) < 65_536:
@@ -106,14 +99,9 @@ def _parse_address(text: str) -> tuple[str, int]:
 def process_bag(
     worker: Worker, source: Path, target: Path, topic: str | None, name: str
 ) -> Iterator[Answer | None]:
-    """Estimate the poses in a recording's images and write them to a new recording.
+    """Estimate the poses in a recording's images and write them to a new ``.mcap`` recording.
 
-    Args:
-        worker: Estimator of the poses.
-        source: Recording of ROS 1 or 2.
-        target: Recording to write, an ``.mcap`` file.
-        topic: Topic of the images; None if the recording has a single image topic.
-        name: Name of the node, which prefixes the topics of the new recording.
+    ``topic`` is None if the recording has a single image topic; ``name`` prefixes the new topics.
 
     Yields:
         The poses in each image, or None if the image cannot be processed.
@@ -133,10 +121,7 @@ def process_bag(
         for seconds, message, info in bag.messages():
             answer = worker.process(Shot(message, info, bag.topic))
             if answer is not None:
-                stamp = stamp_of(message.header.stamp)
-                if stamp == Stamp(0, 0):
-                    stamp = Stamp(int(seconds), int(1e9 * (seconds - int(seconds))))
-                recorder.write(answer, stamp)
+                recorder.write(answer, stamp_of(message) or round(1e9 * seconds))
             yield answer
 
 
@@ -173,13 +158,12 @@ class _Recorder:
         if kind is None:
             next(self._folder.glob(f"*{SUFFIX}")).replace(self._path)
 
-    def write(self, answer: Answer, stamp: Stamp) -> None:
-        """Write the messages of an answer with the recording time ``stamp``."""
+    def write(self, answer: Answer, stamp: int) -> None:
+        """Write the messages of an answer with the recording time ``stamp``, nanoseconds."""
         for message in self._formatter.messages(answer, self._topics.__contains__):
             kind = _ros2_kind(message.kind)
             content = self._store.serialize_cdr(_filled(self._store, kind, message.fields), kind)
-            nanoseconds = stamp.sec * 10**9 + stamp.nanosec
-            self._writer.write(self._topics[message.topic], nanoseconds, content)
+            self._writer.write(self._topics[message.topic], stamp, content)
 
 
 def _ros2_kind(kind: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -11,11 +10,9 @@ from dopepp.geometry.camera import Transform
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.several_views.view_files import CameraPose
 from dopepp.inference.several_views.views_tracker import ViewsTracker
-from dopepp.robot.nodes.worker import Answer, Shot, Stamp, Worker, WorkerSettings
+from dopepp.robot.nodes.worker import Answer, Shot, Worker, WorkerSettings
 
 WORLD: Final = "world"  # default name of the frame of all poses
-
-logger = logging.getLogger(__name__)
 
 
 class ViewsWorker(Worker):
@@ -28,14 +25,13 @@ class ViewsWorker(Worker):
         camera_error: See :meth:`PoseEstimator.predict_views`.
         settings: Initial settings, with refinement.
         track: Track the parts from set to set.
-        warn: Function that is called with the text of each warning.
 
     Raises:
         UserError: The estimator does not support the settings.
     """
 
-    look_up: Callable[[str, Stamp], Transform]
-    """Returns the pose of a camera's optical frame in the world at a time, e.g. from TF."""
+    look_up: Callable[[str, int], Transform]
+    """Returns the pose of a camera's optical frame in the world at a stamp, e.g. from TF."""
 
     def __init__(
         self,
@@ -45,9 +41,8 @@ class ViewsWorker(Worker):
         camera_error: tuple[float, float] | None = None,
         settings: WorkerSettings | None = None,
         track: bool = False,
-        warn: Callable[[str], None] = logger.warning,
     ) -> None:
-        super().__init__(estimator, settings, warn=warn)
+        super().__init__(estimator, settings)
         self.poses, self.world, self._camera_error = poses, world, camera_error
         self._views_tracker = ViewsTracker(self._estimator(True)) if track else None
 
@@ -59,14 +54,10 @@ class ViewsWorker(Worker):
         super().update(settings)
 
     def process(self, *shots: Shot) -> Answer | None:
-        """Estimate the poses in a set of images.
+        """Estimate the poses in the world in a set of images, one of each camera, in order.
 
-        Args:
-            shots: An image of each camera, in the order of the cameras.
-
-        Returns:
-            The poses in the world, with the first image's stamp, or None (after a warning) if an
-            image cannot be processed or has no camera pose.
+        The answer has the first image's stamp. It is None (after a warning) if an image cannot be
+        processed or has no camera pose.
         """
         given = [None] * len(shots) if self.poses is None else [p.camera for p in self.poses]
         decoded = [self._decoded(shot, camera) for shot, camera in zip(shots, given, strict=True)]
@@ -75,8 +66,10 @@ class ViewsWorker(Worker):
             return None
         self._check_time(views[0].stamp, shots[0].topic)
         estimator = self._estimator(True).reporting(self.settings.confidence)
+        estimate = estimator.predict_views
         if self._views_tracker is not None:
             self._views_tracker.estimator = estimator
+            estimate = self._views_tracker.track
         try:
             if self.poses is None:
                 T_world_cam = [self.look_up(view.frame_id, view.stamp) for view in views]
@@ -84,14 +77,9 @@ class ViewsWorker(Worker):
                 T_world_cam = [pose.T_world_cam for pose in self.poses]
             images, cameras = [view.frame.image for view in views], [view.camera for view in views]
             names, error = [shot.topic for shot in shots], self._camera_error
-            estimate = (
-                estimator.predict_views
-                if self._views_tracker is None
-                else self._views_tracker.track
-            )
             result = estimate(images, cameras, T_world_cam, camera_error=error, names=names)
-        except ValueError as error:
-            self._reject("views", str(error))
+        except ValueError as problem:
+            self._reject("views", str(problem))
             return None
         for finding in result.findings:
             self._warn("finding", finding)

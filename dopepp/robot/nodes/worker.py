@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -18,31 +18,18 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
-from dopepp.inference.frames.ros import CameraInfo, decode_image, is_rectified
+from dopepp.inference.frames.ros import camera_of_info, decode_image, is_cropped, is_rectified
 from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
 from dopepp.inference.tracker import PoseTracker
 from dopepp.recovery.detection import Detection
 
 PATIENCE: Final = 5  # number of consecutive images without ``camera_info`` before the warning
-
 OPTICAL: Final = "optical"  # part of the name of each frame whose z axis is forward (REP 103)
 
 logger = logging.getLogger(__name__)
 
 Posed = Detection | WorldDetection  # detection in the frame of a camera, or in the world
-
-
-class Stamp(NamedTuple):
-    """Time of an image as in ROS: whole seconds since 1970, plus nanoseconds."""
-
-    sec: int
-    nanosec: int
-
-    @property
-    def seconds(self) -> float:
-        """Time since 1970 as a single number, seconds."""
-        return self.sec + self.nanosec / 1e9
 
 
 @dataclass(frozen=True)
@@ -64,7 +51,7 @@ class WorkerSettings:
 class Answer:
     """Poses in an image, with the time and frame for ROS messages."""
 
-    stamp: Stamp  # capture time of the image
+    stamp: int  # capture time of the image, nanoseconds since 1970
     frame_id: str  # reference frame: the camera's optical frame, or the world of several cameras
     result: PoseResult | ViewsResult
 
@@ -101,7 +88,7 @@ class Decoded:
     frame: CameraFrame
     camera: Camera
     is_cropped: bool
-    stamp: Stamp
+    stamp: int
     frame_id: str  # name of the camera's optical frame
 
 
@@ -114,7 +101,6 @@ class Worker:
         camera: Camera of all images, in place of their ``camera_info``.
         frame_id: Name of the camera's optical frame, in place of the frame in the messages.
         track: Track the parts from frame to frame; this includes refinement.
-        warn: Function that is called with the text of each warning.
 
     Raises:
         UserError: The estimator does not support the settings.
@@ -127,13 +113,12 @@ class Worker:
         camera: Camera | None = None,
         frame_id: str | None = None,
         track: bool = False,
-        warn: Callable[[str], None] = logger.warning,
     ) -> None:
         self._estimators = {estimator.refiner is not None: estimator}
-        self._camera, self._frame_id, self._send_warning = camera, frame_id, warn
+        self._camera, self._frame_id = camera, frame_id
         self._tracker = PoseTracker(self._estimator(True)) if track else None
         self._warned: set[str] = set()
-        self._last: Stamp | None = None
+        self._last = 0  # stamp of the last image, nanoseconds
         self._number, self._num_without_info = 0, dict[str, int]()
         self._shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
         self.problem = ""
@@ -163,14 +148,7 @@ class Worker:
         return self._estimators[refine]
 
     def process(self, *shots: Shot) -> Answer | None:
-        """Estimate the poses in the image of a ROS message.
-
-        Args:
-            shots: The only image.
-
-        Returns:
-            The poses, or None (after a warning) if the image cannot be processed.
-        """
+        """Estimate the poses in the only image; return None (after a warning) if it is invalid."""
         (shot,) = shots
         decoded = self._decoded(shot, self._camera)
         if decoded is None:
@@ -183,17 +161,14 @@ class Worker:
             return None
         return self._answer(decoded.stamp, decoded.frame_id, result)
 
-    def _answer(self, stamp: Stamp, frame_id: str, result: PoseResult | ViewsResult) -> Answer:
+    def _answer(self, stamp: int, frame_id: str, result: PoseResult | ViewsResult) -> Answer:
         """Return an answer, and count it."""
         self.problem = ""
         self._number += 1
         return Answer(stamp, frame_id, result)
 
     def _decoded(self, shot: Shot, given: Camera | None) -> Decoded | None:
-        """Return an image with its camera, or None after a warning.
-
-        ``given`` is a camera that replaces the camera of ``camera_info``.
-        """
+        """Return an image with its camera (``given``, or ``camera_info``'s), or None and warn."""
         message, info, topic = shot
         try:
             image = decode_image(message)
@@ -201,38 +176,34 @@ class Worker:
             fix = "configure the driver to send rgb8, bgr8 or JPEG"
             self._reject(f"image {topic}", f"an image of {topic}: {error!s:.300}; fix: {fix}")
             return None
-        try:
-            lens = None if info is None else CameraInfo.from_message(info)
-        except Exception as error:
-            self._reject(f"info {topic}", f"the camera_info of {topic}: {error!s:.300}")
-            return None
         missing = self._num_without_info.pop(topic, 0) + 1
-        if lens is None and given is None:
+        if info is None and given is None:
             self._num_without_info[topic] = missing
             if missing == PATIENCE:
                 problem = f"images on {topic} without camera_info: let the driver publish it, or "
                 problem += "pass --camera camera.yaml (from `dopepp calibrate camera`)"
                 self._reject(f"no info {topic}", problem)
             return None
-        stamp = stamp_of(message.header.stamp)
-        frame_id = self._checked_frame(message.header.frame_id, lens, topic)
+        stamp = stamp_of(message)
+        frame_id = self._checked_frame(message.header.frame_id, info, topic)
         try:
-            camera = given or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
+            source = f"camera_info of {topic}"
+            camera = given or camera_of_info(info, source, is_rectified(topic))
             check_size(camera, image)
-        except ValueError as error:  # a wrong value (UserError), or fields of wrong lengths
+        except UserError as error:
             self._reject("camera", str(error))
             return None
-        is_cropped = given is None and lens is not None and lens.roi is not None
-        frame = CameraFrame(image, topic, self._number, stamp.seconds)
-        return Decoded(frame, camera, is_cropped, stamp, frame_id)
+        except Exception as error:  # fields of wrong types or lengths
+            self._reject(f"info {topic}", f"the camera_info of {topic}: {error!s:.300}")
+            return None
+        frame = CameraFrame(image, topic, self._number, stamp / 1e9)
+        return Decoded(frame, camera, given is None and is_cropped(info), stamp, frame_id)
 
     def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
-        """Estimate the poses in an image with the current settings.
+        """Estimate the poses in an image with the current settings, after undistorting it.
 
-        Args:
-            frame: The image.
-            camera: Camera that took the image; its lens distortion is removed first.
-            cropped: Whether the image is a crop, with its principal point far from the centre.
+        ``cropped`` states whether the image is a crop, with its principal point far from the
+        centre.
 
         Raises:
             UserError: The camera was calibrated for another image size.
@@ -250,21 +221,14 @@ class Worker:
             tracks, weaker = self._tracker.track(image, camera.K, cropped), self._tracker.weaker
             detections = [track.detection for track in tracks]
             ids = [track.identity for track in tracks]
+        speed = elapsed_by_step(before, estimator.spent_ms)
+        source = frame.name, frame.number, frame.time
+        threshold = estimator.min_score
         return PoseResult(
-            image,
-            camera.K,
-            detections,
-            elapsed_by_step(before, estimator.spent_ms),
-            frame.name,
-            frame.number,
-            frame.time,
-            ids,
-            self._shapes,
-            weaker,
-            estimator.min_score,
+            image, camera.K, detections, speed, *source, ids, self._shapes, weaker, threshold
         )
 
-    def _checked_frame(self, frame_id: str, info: CameraInfo | None, topic: str) -> str:
+    def _checked_frame(self, frame_id: str, info: Any | None, topic: str) -> str:
         """Return the name of the poses' frame; warn if it does not contain "optical"."""
         if self._frame_id is not None:
             return self._frame_id
@@ -272,22 +236,22 @@ class Worker:
         if OPTICAL not in frame_id:
             problem = "which is not named as an optical frame; "
             problem += "a pose's frame has x right, y down and z forward"
-        elif info is not None and info.frame_id not in ("", frame_id):
-            problem = f"their camera_info in {info.frame_id!r:.80}; the images' frame is used"
+        elif info is not None and info.header.frame_id not in ("", frame_id):
+            other = info.header.frame_id
+            problem = f"their camera_info in {other!r:.80}; the images' frame is used"
         if problem:
             images = f"images on {topic} are in frame {frame_id!r:.80}"
             fix = "name the camera's optical frame: --frame camera_optical_frame"
             self._warn(f"frame {topic}", f"{images}, {problem}; {fix}")
         return frame_id
 
-    def _check_time(self, stamp: Stamp, topic: str) -> None:
+    def _check_time(self, stamp: int, topic: str) -> None:
         """Warn about zero or decreasing stamps; restart the tracking after a decrease."""
-        last, self._last = self._last, stamp
-        if stamp == Stamp(0, 0):
+        decrease_s, self._last = (self._last - stamp) / 1e9, stamp
+        if not stamp:
             problem = f"images on {topic} without a stamp, which TF needs: "
             self._warn("no stamp", f"{problem}let the driver set header.stamp")
-        elif last is not None and stamp < last:
-            decrease_s = last.seconds - stamp.seconds
+        elif decrease_s > 0:
             self._warn(
                 "back",
                 f"stamps on {topic} went back by {decrease_s:.3f} s: a restarted recording or "
@@ -306,18 +270,14 @@ class Worker:
         self._warn(kind, problem)
 
     def _warn(self, kind: str, text: str) -> None:
-        """Send a warning unless a warning of this kind was sent before."""
+        """Log a warning unless a warning of this kind was logged before."""
         if kind not in self._warned:
             self._warned.add(kind)
-            self._send_warning(text)
+            logger.warning(text)
 
 
 def check_size(camera: Camera, image: RGBImage) -> None:
-    """Check that a camera was calibrated for the size of an image.
-
-    Raises:
-        UserError: It was calibrated for another size.
-    """
+    """Raise a ``UserError`` if a camera was calibrated for another size than an image's."""
     size = (image.shape[1], image.shape[0])
     if camera.size is not None and camera.size != size:
         sizes = f"{camera.size[0]}×{camera.size[1]}, and images of {size[0]}×{size[1]}"
@@ -326,6 +286,6 @@ def check_size(camera: Camera, image: RGBImage) -> None:
         raise UserError(f"{camera.source} of {sizes}", "a camera of the images' size", fix)
 
 
-def stamp_of(stamp: Any) -> Stamp:
-    """Return the :class:`Stamp` of a ROS message's ``header.stamp``."""
-    return Stamp(int(stamp.sec), int(stamp.nanosec))
+def stamp_of(message: Any) -> int:
+    """Return the stamp in the header of a ROS message, nanoseconds since 1970."""
+    return 10**9 * int(message.header.stamp.sec) + int(message.header.stamp.nanosec)

@@ -78,28 +78,13 @@ def test_colour_channels_are_rgb(tmp_path, write_clip):
     assert frame.image[..., 0].mean() > 180 > 30 > frame.image[..., 1:].mean()
 
 
-@pytest.mark.parametrize("mode", ["L", "I;16", "RGBA", "CMYK", "P"])
-def test_images_of_any_mode_are_converted_to_rgb(tmp_path, mode):
-    levels = np.arange(64 * 48).reshape(48, 64) % 200
-    image = Image.fromarray(levels.astype(np.uint8)).convert("RGB")
-    if mode == "I;16":
-        image = Image.fromarray((257 * levels).astype(np.uint16))
-    elif mode == "P":
-        image = image.quantize(200)
-    else:
-        image = image.convert(mode)
-    path = tmp_path / ("image.tif" if mode in ("CMYK", "I;16") else "image.png")
-    image.save(path)
-    frame = only_frame(path)
+@pytest.mark.parametrize("mode", ["CMYK", "P"])
+def test_images_of_rare_modes_are_converted_to_rgb(tmp_path, mode):
+    levels = (np.arange(64 * 48).reshape(48, 64) % 200).astype(np.uint8)
+    Image.fromarray(levels).convert("RGB").convert(mode).save(tmp_path / "image.tif")
+    frame = only_frame(tmp_path / "image.tif")
     assert (frame.image.shape, frame.image.dtype) == ((48, 64, 3), np.uint8)
     assert np.abs(frame.image.mean(axis=2) - levels).max() <= 2
-
-
-def test_exif_orientation_is_applied(tmp_path):
-    exif = Image.Exif()
-    exif[274] = 6
-    Image.fromarray(grey(0, (64, 48))).save(tmp_path / "turned.jpg", exif=exif)
-    assert only_frame(tmp_path / "turned.jpg").image.shape == (64, 48, 3)
 
 
 @pytest.mark.parametrize(

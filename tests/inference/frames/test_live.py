@@ -3,11 +3,13 @@
 import queue
 import threading
 from itertools import islice
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dopepp.core.errors import RunError, UserError
+from dopepp.inference.frames import media
 from dopepp.inference.frames.media import Live
 
 PERIOD = 1 / 30
@@ -60,15 +62,17 @@ class Camera:
 
 
 @pytest.fixture
-def camera():
+def camera(monkeypatch):
     camera = Camera()
     camera.advance(0, wait=False)
+    monkeypatch.setattr(media, "_open_live", lambda _: camera)
+    monkeypatch.setattr(media, "time", SimpleNamespace(time=camera.now))
     return camera
 
 
 def test_slow_reader_gets_the_newest_frame(camera):
     """Simulate a minute in which each inference takes six camera periods."""
-    source = Live(0, lambda _: camera, camera.now)
+    source = Live(0)
     ages, frames = [], source.frames()
     for frame in islice(frames, 300):
         camera.advance(INFERENCE)
@@ -82,7 +86,7 @@ def test_slow_reader_gets_the_newest_frame(camera):
 
 def test_frames_have_their_arrival_times(camera):
     times = []
-    for frame in islice(Live(0, lambda _: camera, camera.now).frames(), 3):
+    for frame in islice(Live(0).frames(), 3):
         times.append(frame.time)
         camera.advance(1.0)
     assert times == pytest.approx([0, 1, 2])
@@ -106,10 +110,12 @@ class Dead(Camera):
 
 @pytest.mark.parametrize("hangs", [False, True])
 @pytest.mark.parametrize(("alive", "message"), [(0, "since it was opened"), (1, "no image for")])
-def test_camera_without_further_frames_is_an_error(hangs, alive, message):
-    source = Live(3, lambda _: Dead(alive, hangs), first_s=0.2, stalled_s=0.2)
+def test_camera_without_further_frames_is_an_error(hangs, alive, message, monkeypatch):
+    monkeypatch.setattr(media, "_open_live", lambda _: Dead(alive, hangs))
+    for name in ("FIRST_S", "STALLED_S"):
+        monkeypatch.setattr(media, name, 0.2)
     with pytest.raises(RunError, match=message) as raised:
-        list(source.frames())
+        list(Live(3).frames())
     assert str(raised.value).startswith("camera 3: no image for 0.2 s")
 
 

@@ -39,6 +39,14 @@ def test_the_errors_of_the_lens_fit_its_deviations(views):
     assert (result.findings, result.outliers) == ((), ())
 
 
+def test_equal_views_have_equal_calibrations(views):
+    camera, detections = views
+    results = [calibrate_lens(detections, camera.size) for _ in range(4)]
+    for result in results[1:]:
+        np.testing.assert_array_equal(result.camera.K, results[0].camera.K)
+        assert result.camera.distortion == results[0].camera.distortion
+
+
 def test_the_file_is_read_by_every_camera_option(views, tmp_path):
     camera, detections = views
     result = calibrate_lens(detections, camera.size).camera
@@ -65,18 +73,15 @@ def test_views_in_the_middle_only_are_not_trusted(views):
     assert any("cover" in finding for finding in calibrate_lens(middle, wide).findings)
 
 
-def test_parallel_views_are_not_trusted(views):
-    camera, _ = views
+def test_parallel_views_are_not_trusted_and_two_views_are_rejected(views):
+    camera, detections = views
+    with pytest.raises(UserError, match="at least 3"):
+        calibrate_lens(detections[:2], camera.size)
     board, parallel = parse_board("charuco:9x7:25:18"), []
     for k in range(8):
         T = move_pose(np.eye(4), np.array([0.01 * k, 0, 0.2 * k, 0.03 * k - 0.2, -0.1, 0.4]))
         parallel.append(take(board, T, camera, str(k)))
     assert any("parallel" in finding for finding in calibrate_lens(parallel, camera.size).findings)
-
-
-def test_two_views_are_rejected(views):
-    with pytest.raises(UserError, match="at least 3"):
-        calibrate_lens(views[1][:2], views[0].size)
 
 
 POINTS = parse_board("charuco:8x6:25:19").points
@@ -95,23 +100,13 @@ def test_of_similar_frames_the_frame_with_the_least_motion_is_kept():
     assert [view.name for view in views.kept] == ["102", "200", "300"]
 
 
-def test_other_corners_of_the_board_are_another_view():
-    views = Views(1000)
+def test_other_corners_and_a_rotated_board_are_other_views():
+    views, quarter = Views(1000), np.array([[0.0, 1], [-1, 0]])
     assert views.add(at(0, "left", POINTS[:15]))
     assert views.add(at(0, "right", POINTS[15:]))
     assert not views.add(at(0, "left again", POINTS[:15]))
-
-
-def test_the_number_of_views_is_limited():
-    views = Views(1000)
-    for number in range(MAX_VIEWS):
-        assert not views.is_full
+    assert views.add(BoardDetection("rotated", POINTS, 1000 * POINTS[:, :2] @ quarter))
+    assert not views.is_full
+    for number in range(1, MAX_VIEWS):
         views.add(at(50 * number, str(number)))
     assert views.is_full
-
-
-def test_a_rotated_board_is_another_view():
-    views, quarter = Views(1000), np.array([[0.0, 1], [-1, 0]])
-    rotated = BoardDetection("rotated", POINTS, 1000 * POINTS[:, :2] @ quarter)
-    assert views.add(at(0, "straight"))
-    assert views.add(rotated)

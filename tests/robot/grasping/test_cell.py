@@ -12,9 +12,10 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, project_keypoints, transform
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.convex import convex_pieces
-from dopepp.robot.grasping.cell import TRAY, Cell, Solid
+from dopepp.robot.grasping.cell import TRAY, Cell
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K, downward_view
 from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
+from dopepp.virtual.body import make_body
 
 
 @pytest.mark.parametrize("name", sorted(BUILTIN))
@@ -34,7 +35,7 @@ def test_a_part_without_a_mesh_has_no_pieces(part):
 
 
 def test_a_solid_has_the_pose_at_which_it_was_placed(part):
-    cell = Cell([Solid(convex_pieces(part))] * 2)
+    cell = Cell([make_body(part, is_target=True)] * 2)
     state = cell.data()
     rotation = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
     T = make_transform(rotation, np.array([0.1, 0.2, 0.3]))
@@ -64,7 +65,7 @@ def test_parts_of_a_heap_hardly_move_and_do_not_overlap(part):
     layout = Layout(part, "heap", yaw_deg=180.0, rest="front")
     for seed in range(3):
         heap = layout.draw(np.random.default_rng(seed))
-        cell = Cell([item.solid for item in heap])
+        cell = Cell([item.body for item in heap])
         state = cell.data()
         for index, item in enumerate(heap):
             cell.put(state, index, item.T_base_obj)

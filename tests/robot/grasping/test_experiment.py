@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from dopepp.core.errors import RunError, UserError
+from dopepp.core.errors import RunError
 from dopepp.core.files import read_csv
 from dopepp.core.pool import LostWorkerError, ProcessPool
-from dopepp.robot.grasping import grasp_experiment
-from dopepp.robot.grasping.grasp_experiment import HeapCounts, check_task, markdown, run_trials
+from dopepp.robot.grasping import grasp_experiment, grasp_report
+from dopepp.robot.grasping.grasp_experiment import check_task, parse_sources, run_trials
+from dopepp.robot.grasping.grasp_report import HeapCounts, markdown
 from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, Record
 
 
@@ -46,11 +47,11 @@ def test_failures_are_counted_by_kind(records):
     text = markdown(records, {})
     row = next(line for line in text.splitlines() if line.startswith("| network |"))
     assert row.split("|")[-6:-1] == [" 1 ", " 0 ", " 1 ", " 0 ", " 2 "]
-    assert grasp_experiment.count_records(records).trials == 3 * 54
+    assert grasp_report.count_records(records).trials == 3 * 54
 
 
 def test_all_formats_hold_every_trial(records, tmp_path):
-    grasp_experiment.write_report(tmp_path, records, {"seed": 0})
+    grasp_report.write_report(tmp_path, records, {"seed": 0})
     rows = read_csv(tmp_path / "grasps.csv")
     content = json.loads((tmp_path / "grasps.json").read_text())
     assert len(rows) == len(content["trials"]) == len(records)
@@ -72,7 +73,7 @@ def test_heaps_are_counted_by_their_last_attempt():
     # A heap emptied in four attempts, one in two with a double catch, and one left with a part.
     heaps = [*attempts(0, 1, 0, 1, 1), *attempts(1, 2, 1), *attempts(2, 0, 1, 0, 1, 0, 0)]
     counts = HeapCounts(3, emptied=2, parts=9, lifted=8, attempts=12)
-    assert grasp_experiment.count_heaps(heaps[::-1]) == counts
+    assert grasp_report.count_heaps(heaps[::-1]) == counts
     text = markdown(heaps, {})
     assert "| network | 3 | 66.7 % (20.8 – 93.9) | 8 of 9 | 66.7 % (20.8 – 93.9) |" in text
     row = next(line for line in text.splitlines() if line.startswith("| network | 12 |"))
@@ -89,9 +90,7 @@ def test_two_processes_and_one_process_run_equal_trials(trials):
     source = TASK.sources[0]
     expected = [trials.attempt(trials.scene(number), source).record for number in (0, 1)]
     records = sorted(run_trials(TASK, 2, workers=2), key=lambda trial: trial[0].number)
-    for (record,), other in zip(records, expected, strict=True):
-        assert (record.number, record.caught) == (other.number, other.caught)
-        assert record.hand_eye_mm == pytest.approx(other.hand_eye_mm, rel=1e-3)
+    assert [record for (record,) in records] == expected
 
 
 def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
@@ -107,13 +106,10 @@ def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
 
 
 def test_equal_sources_are_used_once_and_a_curve_is_many_sources():
-    parse_sources = grasp_experiment.parse_sources
     assert parse_sources("exact, exact,random") == (PoseSource("exact"), PoseSource("random"))
     names = [source.name for source in parse_sources("curve")]
     assert names[0] == "exact poses, off by 1 mm and 1°"
     assert len(set(names)) == len(names) == 6
-    with pytest.raises(UserError, match="--poses truth"):
-        parse_sources("exact,truth")
 
 
 def test_a_network_is_omitted_if_no_source_needs_it():

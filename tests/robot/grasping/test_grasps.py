@@ -1,7 +1,5 @@
 """Files of grasps are written and read, and invalid files are rejected."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -63,8 +61,3 @@ def test_an_invalid_file_is_rejected_with_the_field(part, tmp_path, text, messag
     (tmp_path / "g.yaml").write_text(text)
     with pytest.raises(UserError, match=f"(?s).*{message}"):
         read_grasps(tmp_path / "g.yaml", part)
-
-
-def test_the_error_for_a_part_without_grasps_names_the_command(part, tmp_path):
-    with pytest.raises(UserError, match="dopepp grasp propose bracket"):
-        find_grasps(replace(part, name="bracket"))

@@ -30,19 +30,20 @@ def test_a_part_at_a_known_pose_is_caught(trials, scene):
     assert states[-1][-5] > states[0][-5] + 0.1
 
 
-def test_a_part_at_another_pose_is_not_caught(trials, scene, monkeypatch):
-    shift = make_transform(np.eye(3), [0.0, 0.05, 0.0])
-    aside = [EstimatedPart(pose @ shift) for pose in scene.targets]
-    monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation(aside, scene.joints))
+@pytest.mark.parametrize(
+    ("shifts", "expected"),
+    [
+        ([[0.0, 0.05, 0.0]], (True, False, False, "wrong pose")),
+        ([], (False, False, False, "not seen")),
+    ],
+)
+def test_a_wrong_or_missing_pose_is_a_failure(trials, scene, monkeypatch, shifts, expected):
+    poses = [scene.targets[0] @ make_transform(np.eye(3), shift) for shift in shifts]
+    observation = SceneObservation([EstimatedPart(pose) for pose in poses], scene.joints)
+    monkeypatch.setattr(trials, "_observe", lambda *_: observation)
     record = trials.attempt(scene, PoseSource("exact")).record
-    result = record.caught, record.recognised, record.failure, record.error_mm
-    assert result == (False, False, "wrong pose", pytest.approx(50))
-
-
-def test_no_estimated_pose_is_the_failure_not_seen(trials, scene, monkeypatch):
-    monkeypatch.setattr(trials, "_observe", lambda *_: SceneObservation([], scene.joints))
-    record = trials.attempt(scene, PoseSource("exact")).record
-    assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
+    assert (record.seen, record.caught, record.recognised, record.failure) == expected
+    assert not shifts or record.error_mm == pytest.approx(50)
 
 
 class Attempts(Trials):

@@ -10,7 +10,7 @@ from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.several_views.views_result import WorldDetection
 from dopepp.robot.grasping.cell import TRAY
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
-from dopepp.robot.grasping.viewpoint import choose_viewpoint
+from dopepp.robot.grasping.selection import choose_viewpoint
 
 COVARIANCE = np.diag(np.repeat([np.radians(0.3), 1e-3], 3) ** 2)
 

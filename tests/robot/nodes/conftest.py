@@ -57,6 +57,14 @@ def info_message(K, size, **changes):
     return SimpleNamespace(**fields | changes)
 
 
+@pytest.fixture
+def warnings(monkeypatch):
+    """Texts of the warnings that workers log."""
+    texts = []
+    monkeypatch.setattr("dopepp.robot.nodes.worker.logger.warning", texts.append)
+    return texts
+
+
 @pytest.fixture(scope="session")
 def messages():
     return SimpleNamespace(image=image_message, info=info_message, topic=TOPIC, frame=FRAME)
@@ -69,18 +77,15 @@ def recording(camera, tmp_path_factory):
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
+    arrays = {bytes: lambda data: np.frombuffer(data, np.uint8), list: np.array}
 
     def native(kind, message):
         fields = {}
         for name, node in store.fielddefs[kind][1]:
             value = getattr(message, name)
-            if node[0].name == "NAME":
-                value = native(node[1], value)
-            elif isinstance(value, bytes):
-                value = np.frombuffer(value, np.uint8)
-            elif isinstance(value, list):
-                value = np.array(value, np.float64)
-            fields[name] = value
+            is_nested = node[0].name == "NAME"
+            convert = arrays.get(type(value), lambda value: value)
+            fields[name] = native(node[1], value) if is_nested else convert(value)
         return store.types[kind](**fields)
 
     folder = tmp_path_factory.mktemp("bag") / "run"

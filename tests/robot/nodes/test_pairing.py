@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dopepp.robot.nodes.pairing import WAITING, StampPairing
+from dopepp.robot.nodes.image_queue import WAITING, StampPairing
 
 MAX_LAG = 0.016
 
