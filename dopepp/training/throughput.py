@@ -27,8 +27,7 @@ FOLDER: Final = "profile"  # Folder of the run with the report and traces
 _STARVED: Final = 0.2  # Share of waiting above which a hint is logged
 _FILE: Final = "report"
 
-Total = tuple[str, int, float]
-"""Name of a hook or operator, number of calls, and total seconds."""
+Total = tuple[str, int, float]  # name of a hook or operator, number of calls, and total seconds
 
 
 class Throughput(Callback):

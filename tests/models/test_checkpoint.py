@@ -16,10 +16,10 @@ from dopepp.models.checkpoint import (
     load_network,
     read,
     released_paths,
-    write_atomic,
     write_content,
 )
 from dopepp.models.network import build_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Mesh, make_part
 from dopepp.parts.size import LearnedRange
 from tests.models.conftest import assert_weights

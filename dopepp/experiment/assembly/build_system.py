@@ -53,8 +53,7 @@ _PROBE_ITEMS: Final = 3
 _PROBE_S: Final = 2.0
 """Number of loaded items and seconds of a timed step, for the estimate of a run's duration."""
 
-_BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})
-"""Names of the instruction sets on x86 and Arm."""
+_BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})  # names of the instruction sets on x86 and Arm
 
 _AMD_BF16_FLAG: Final = "avx512_bf16"
 """Instruction set that makes bf16 fast on AMD only. On Intel, AVX-512 bf16 is slower than float32,

@@ -17,8 +17,7 @@ from dopepp.data.sample import DescribedSource, Sample, SourceInfo
 from dopepp.geometry.camera import Transform
 from dopepp.inference.several_views.view_files import CameraPoses, read_camera_poses
 
-ANGLE_DEG: Final = 25.0
-"""Preferred angle between the optical axes of two cameras, degrees."""
+ANGLE_DEG: Final = 25.0  # preferred angle between the optical axes of two cameras, degrees
 
 
 class StaticScenes:

@@ -27,11 +27,9 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 16384)]
 
-MAX_WORKERS: Final = 1024
-"""Maximum number of loader processes."""
+MAX_WORKERS: Final = 1024  # maximum number of loader processes
 
-_MULTIPLE: Final = 32
-"""Both sides of the network's input are multiples of this number of pixels."""
+_MULTIPLE: Final = 32  # both sides of the network's input are multiples of this number of pixels
 
 _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_sets")
 """Nodes to which an evaluation cannot add options."""

@@ -27,11 +27,9 @@ _MAX_EPOCHS: Final = 10**9
 _MAX_WAIT_S: Final = 7 * 24 * 3600
 _MIN_CELLS: Final = 0.1
 """Minimum width of a peak or disc in cells; a narrower peak may cover no cell."""
-_MAX_THRESHOLD: Final = 1000
-"""Maximum width of a peak or disc in cells."""
+_MAX_THRESHOLD: Final = 1000  # maximum width of a peak or disc in cells
 
-AUTO: Final = "auto"
-"""Value of ``init_from`` that selects the package's initial weights if they fit."""
+AUTO: Final = "auto"  # value of `init_from` that selects the package's initial weights if they fit
 
 Cells = Annotated[float, Range(_MIN_CELLS, _MAX_THRESHOLD)]
 Rate = Annotated[float, Range(1e-12, 1e3)]
@@ -40,8 +38,7 @@ Rate = Annotated[float, Range(1e-12, 1e3)]
 QuantityName = Literal["distance", "visibility", "size", "rotation"]
 """Quantities by which rates can be broken down (``dopepp.experiment.results.breakdown``)."""
 
-_MAX_SCALE: Final = 20.0
-"""Largest factor by which the camera moves nearer or farther."""
+_MAX_SCALE: Final = 20.0  # largest factor by which the camera moves nearer or farther
 
 
 @dataclass(frozen=True, kw_only=True)

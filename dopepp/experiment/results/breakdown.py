@@ -36,8 +36,7 @@ from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics, matching_
 
 _log = logging.getLogger(__name__)
 
-Numbers = Float[np.ndarray, "n"]
-"""One number per instance."""
+Numbers = Float[np.ndarray, "n"]  # one number per instance
 
 
 class Quantity(NamedTuple):

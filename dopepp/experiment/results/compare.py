@@ -70,10 +70,8 @@ _LOGGED: Final = {
 
 _MIN_COLUMNS: Final = 3
 """Minimum number of columns for the tile size; fewer methods would make the tiles too large."""
-_PANEL_PX: Final = 768
-"""Width of a panel if there are no curves."""
-_GAP_PX: Final = 12
-"""Space between tiles."""
+_PANEL_PX: Final = 768  # width of a panel if there are no curves
+_GAP_PX: Final = 12  # space between tiles
 _TOO_WIDE: Final = (
     "ADD<5cm %",
     "ADD<10cm %",

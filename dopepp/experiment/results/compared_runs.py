@@ -30,8 +30,7 @@ from dopepp.experiment.results.folder import (
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.report import Cost, Report
 
-BASELINE: Final = "dope"
-"""Default name of the baseline: the first method, to which every Δ refers."""
+BASELINE: Final = "dope"  # default name of the baseline: the first method, to which every Δ refers
 
 _HYDRA: Final = ".hydra"
 _TRACES: Final = (_HYDRA, CONFIG_FILE, METRICS_FILE, FAILURE_FILE)
@@ -46,8 +45,7 @@ _BESIDE: Final = ("shading", "scale_factors", "by", "num_bins", "bop_csv", "all_
 _CHOSEN_SIZES: Final = (("data", "input_size"), ("virtual", "camera_scale"))
 """Options whose default (null) is replaced by a value that suits the sizes of the objects."""
 
-_LONGEST_NAME: Final = 60
-"""Maximum length of a method's name in tables and legends."""
+_LONGEST_NAME: Final = 60  # maximum length of a method's name in tables and legends
 
 
 @dataclass

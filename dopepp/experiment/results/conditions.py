@@ -74,8 +74,7 @@ _LABELS: Final = ("method", "object")
 _MARGIN: Final = 0.3
 """Margin around shaded objects on the sheet of examples, as a share of their extent."""
 
-_NOTABLE: Final = 0.05
-"""Smallest change of the mean visible fraction that a note mentions."""
+_NOTABLE: Final = 0.05  # smallest change of the mean visible fraction that a note mentions
 
 
 @dataclass(frozen=True)

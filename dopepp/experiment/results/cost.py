@@ -57,8 +57,7 @@ FIELD_NOISE: Final = 0.05
 """Standard deviation per cell of the noise on the true maps. With this noise, recovery takes about
 as long as on the maps of trained networks (``benchmarks/decode.py``)."""
 
-WARM_UP: Final = 3
-"""Number of untimed passes, which allocate memory, select kernels and compile."""
+WARM_UP: Final = 3  # number of untimed passes, which allocate memory, select kernels and compile
 
 _NUM_IMAGES: Final = 8
 _BATCHES: Final = 3

@@ -26,11 +26,9 @@ from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 TITLE: Final = "Images without the part"
-KEY: Final = "without_part"
-"""Key of ``Report.details``: a :class:`FalseAlarms` as a dictionary."""
+KEY: Final = "without_part"  # key of `Report.details`: a `FalseAlarms` as a dictionary
 
-NUM_LOUDEST: Final = 6
-"""Number of images with the highest scores to name and to draw."""
+NUM_LOUDEST: Final = 6  # number of images with the highest scores to name and to draw
 
 
 @dataclass(frozen=True)

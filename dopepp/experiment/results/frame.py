@@ -28,11 +28,9 @@ from dopepp.metrics.pose import MEAN, EvaluatedInstances
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetry_transforms
 from dopepp.parts.part import Parts
 
-Row = dict[str, str]
-"""Texts of a table row by column heading."""
+Row = dict[str, str]  # texts of a table row by column heading
 
-DELTA: Final = "Δ "
-"""Prefix of measures that are differences to the baseline."""
+DELTA: Final = "Δ "  # prefix of measures that are differences to the baseline
 
 COST_FORMS: Final = {"parameters": ",.0f", "GMACs": ".3f", "ms/frame": ".1f"}
 """Format of each cost measure."""

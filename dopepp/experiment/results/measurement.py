@@ -44,8 +44,7 @@ from dopepp.virtual.surface import Surface, make_surface
 
 _log = logging.getLogger(__name__)
 
-ImageId = tuple[int, int]
-"""BOP's scene_id and im_id."""
+ImageId = tuple[int, int]  # BOP's scene_id and im_id
 
 _WARM_UP_FRAMES: Final = 3
 """Number of untimed first frames, which allocate memory and select kernels."""

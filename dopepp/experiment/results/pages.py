@@ -77,8 +77,7 @@ FILES: Final = {
 _IMAGES: Final = [name for name in FILES if name.endswith(".png") and name != "val_auc.png"]
 """Images that a run's README shows."""
 
-MAX_BYTES: Final = 8_000_000
-"""Maximum size of a released file, which is part of the package."""
+MAX_BYTES: Final = 8_000_000  # maximum size of a released file, which is part of the package
 
 _CARD_FIELDS: Final = (
     "num_instances",

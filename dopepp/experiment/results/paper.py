@@ -55,18 +55,15 @@ TABLE_FILE: Final = "table.csv"
 Printed = Mapping[str, Mapping[str, Mapping[str, int | float]]]
 """Printed values by label, object and measure."""
 
-_LABELS: Final = ("method", "object", "measure")
-"""Headings of text columns."""
+_LABELS: Final = ("method", "object", "measure")  # headings of text columns
 
 _METHOD, _OBJECT, _MEASURE = _LABELS
 _STRICT: Final = "add_01d"
-_NETWORK: Final = "network"
-"""Key of the whole network's values, in place of an object."""
+_NETWORK: Final = "network"  # key of the whole network's values, in place of an object
 _PAPER: Final = "the paper"
 
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
-_MEASURED: Final = ("poses", "shading")
-"""Kinds of tables that need trained networks."""
+_MEASURED: Final = ("poses", "shading")  # kinds of tables that need trained networks
 _UNTRAINED: Final = "dopepp.models.backbones.VGG19"
 
 
@@ -204,8 +201,7 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
 
 
-RowsAndNotes = tuple[list[Row], list[str]]
-"""Rows of a table, and notes on their uncertainty."""
+RowsAndNotes = tuple[list[Row], list[str]]  # rows of a table, and notes on their uncertainty
 
 
 def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:

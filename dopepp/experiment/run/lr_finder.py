@@ -36,16 +36,14 @@ TABLE_FILE: Final = "lr_finder.csv"
 PICTURE_FILE: Final = "lr_finder.png"
 
 _MIN_STEPS: Final = 10
-_MOST: Final = 10**6
-"""Maximum number of epochs; the number of steps ends the sweep."""
+_MOST: Final = 10**6  # maximum number of epochs; the number of steps ends the sweep
 
 _SMOOTHING: Final = 0.05
 """Standard deviation of the smoothing as a share of the sweep, against the noise of batches."""
 _SKIPPED: Final = 0.1
 """Ignored share at the beginning of the sweep, in which the optimiser's averages and the statistics
 of batch norm settle."""
-_MIN_FALL: Final = 0.05
-"""Minimum relative fall of the loss for a suggestion."""
+_MIN_FALL: Final = 0.05  # minimum relative fall of the loss for a suggestion
 
 
 Steps = Float[np.ndarray, "steps"]

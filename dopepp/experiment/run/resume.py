@@ -215,8 +215,7 @@ _MAX_LEVELS: Final = 2.0
 """Mean difference of two small images, in grey levels, above which they count as different."""
 _MAX_LABEL: Final = 1e-4
 """Difference of camera matrices (relative) or poses (metres) that counts as a change."""
-_LONG: Final = 40
-"""Maximum number of characters of a shown value."""
+_LONG: Final = 40  # maximum number of characters of a shown value
 
 
 def describe_images(source: DescribedSource) -> dict[str, Any]:

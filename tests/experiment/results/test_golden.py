@@ -32,8 +32,9 @@ from dopepp.experiment.results.pages import release
 from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import COLUMNS, PoseRow, mean_row
-from dopepp.models.checkpoint import Checkpoint, read, write_atomic
+from dopepp.models.checkpoint import Checkpoint, read
 from dopepp.models.network import build_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts import load_part
 from tests.experiment.conftest import report_of, write_run
 

@@ -14,7 +14,8 @@ from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import made_worse
 from dopepp.experiment.run.evaluate import tune_and_record
 from dopepp.metrics.pose import PoseMetrics
-from dopepp.models.checkpoint import read, write_atomic
+from dopepp.models.checkpoint import read
+from dopepp.models.storage import write_atomic
 from dopepp.parts.catalogue import pivconnector
 
 NETWORK = "ckpt_path=pretrained/pivconnector"
