@@ -97,10 +97,7 @@ def entry(
     short_names: Mapping[str, str] | None = None,
     num_words: int = 1,
 ) -> None:
-    """Run ``main``, which passes ``sys.argv`` to Hydra; exit with one line on an expected error.
-
-    The remaining arguments are as in :func:`~dopepp.experiment.command_line.prepare`.
-    """
+    """Run ``main``, which passes ``sys.argv`` to Hydra; exit with one line on an expected error."""
     # With this variable Hydra raises its errors instead of printing pages of text.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     program.configure_logging()

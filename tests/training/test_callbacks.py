@@ -22,7 +22,7 @@ from dopepp.training.pose_validation import (
     batch_instances,
 )
 from dopepp.training.system import PoseSystem, ValidationOutput
-from dopepp.training.throughput import Operators, Throughput, make_profiler, profile_rows
+from dopepp.training.throughput import Throughput, make_profiler, profile_rows
 
 
 class Displaced(PoseSystem):
@@ -167,17 +167,13 @@ def test_the_simple_profiler_lists_the_slowest_hooks(tmp_path):
     assert "step" in report.read_text()
 
 
-def test_the_operators_of_training_and_validation(tmp_path):
-    profiler = Operators(tmp_path / "profile")
+def test_the_operators_of_a_training(make_system, make_noise, make_trainer, tmp_path):
+    profiler = make_profiler("pytorch", tmp_path)
     assert profile_rows(profiler) == []
-    activities = [torch.profiler.ProfilerActivity.CPU]
-    for _ in range(2):
-        recording = torch.profiler.profile(activities=activities, on_trace_ready=profiler._collect)
-        with recording, torch.profiler.record_function("[pl][profile]hook"):
-            torch.ones(8, 8) @ torch.ones(8, 8)
-    rows = {row["what"]: row for row in profile_rows(profiler, limit=100)}
-    assert rows["aten::mm"]["calls"] == "2"
-    assert not any("hook" in name for name in rows)
-    assert "2 calls  aten::mm" in profiler.summary()
-    traces = sorted(path.name for path in (tmp_path / "profile").iterdir())
-    assert traces == ["trace_0.json", "trace_1.json"]
+    trainer = make_trainer(tmp_path, [], profiler=profiler, enable_checkpointing=False)
+    trainer.fit(make_system(), datamodule=make_noise())
+    rows = {row["what"]: row for row in profile_rows(profiler, limit=1000)}
+    assert int(rows["aten::conv2d"]["calls"]) > 0
+    names = [path.name for path in (tmp_path / "profile").iterdir()]
+    assert [name.endswith(".txt") for name in sorted(names, key=len)] == [True, False]
+    assert any(name.endswith(".json") for name in names)

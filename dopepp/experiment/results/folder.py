@@ -34,15 +34,13 @@ PRUNED_FILE: Final = "pruned.json"
 OBJECTIVE: Final = "objective"
 """Key of ``metrics.json``: validation value by which the best checkpoint was selected."""
 OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
+# Files of a run folder that are written before the work begins.
 OF_THE_START: Final = frozenset({".hydra", CONFIG_FILE, VERSIONS_FILE, "README.md"})
-"""Files of a run folder that are written before the work begins."""
-DIFFERENCE: Final = "working_tree_"
-"""Prefix of the file with the uncommitted changes of the working tree."""
+DIFFERENCE: Final = "working_tree_"  # prefix of the file with uncommitted changes
 BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
 LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
-_MAX_DIFF_BYTES: Final = 10_000_000
-"""Maximum size of stored uncommitted changes; of larger changes, only the hash is stored."""
+_MAX_DIFF_BYTES: Final = 10_000_000  # of larger changes, only the hash is stored
 _MAX_UNTRACKED: Final = 100
 
 
@@ -58,11 +56,7 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON record of a run folder.
-
-    Raises:
-        UserError: The file is missing or is not a JSON object.
-    """
+    """Read a JSON object of a run folder."""
     try:
         record = read_strict_json(path)
     except UserError as error:
@@ -80,11 +74,7 @@ def write_environment(
 ) -> None:
     """Write the :func:`environment` of a run to ``versions.json``, and keep earlier entries.
 
-    Args:
-        run_dir: Run folder.
-        seed: Seed of the run.
-        data_fingerprint: Hash of the data; empty if unknown.
-        changes: Changes of the config since the run began or was last resumed.
+    ``changes`` are those of the config since the run began or was last resumed.
     """
     path = run_dir / VERSIONS_FILE
     earlier: list[object] = []

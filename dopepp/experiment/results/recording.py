@@ -80,21 +80,18 @@ def measure_and_record(
 
     Returns:
         A report per estimator, then per file.
-
-    Raises:
-        UserError: The data or a file of poses is invalid.
     """
     protocols = protocols or Protocols()
     source = held_out_source(data, parts, "test")
     numbers = object_numbers(data, parts)
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
-    methods: dict[str, Method] = {
-        **{
-            name: EstimatorMethod(estimator, parts)
-            for name, estimator in with_refining(estimators, refine, parts).items()
-        },
-        **files,
-    }
+    methods: dict[str, Method] = {}
+    for name, estimator in estimators.items():
+        methods[name] = EstimatorMethod(estimator, parts)
+        if refine is not None and estimator.has_network:
+            refined = " + ".join([name, *refine_terms(refine)])
+            methods[refined] = EstimatorMethod(refining(estimator, refine, parts), parts)
+    methods |= files
     # Impossible protocols are rejected before anything is measured.
     if protocols.shading:
         conditions.SHADING.check_methods(methods)
@@ -166,23 +163,8 @@ def main_report(reports: Sequence[Report]) -> Report:
     return next((report for report in reports if report.refined is not None), reports[-1])
 
 
-def with_refining(
-    estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
-) -> dict[str, PoseEstimator]:
-    """Return the estimators by name; with ``refine``, a refining copy follows each network."""
-    pairs: dict[str, PoseEstimator] = {}
-    for name, estimator in estimators.items():
-        pairs[name] = estimator
-        if refine is not None and estimator.has_network:
-            pairs[" + ".join([name, *refine_terms(refine)])] = refining(estimator, refine, parts)
-    return pairs
-
-
 def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
-    """Return a copy of an estimator that refines its poses; without ``refine``, the estimator.
-
-    Parts of the checkpoint without a mesh use the mesh of ``parts``.
-    """
+    """Return a copy of an estimator that refines its poses; without ``refine``, the estimator."""
     if refine is None:
         return estimator
     by_name = {part.name: part for part in parts}
@@ -193,12 +175,9 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
 
 
 def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
-    """Return the shares of refined poses that exceed the network's error by more than 1 mm.
+    """Return the shares of refined poses whose ADD or translation error grew by more than 1 mm.
 
     Parts that are missing after refinement are ignored; the recall includes them.
-
-    Returns:
-        Shares by error: ``add`` and ``translation``.
     """
     shares = {}
     for error in ("add", "translation"):

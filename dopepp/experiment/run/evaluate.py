@@ -83,9 +83,6 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
     Unless ``data.symmetries`` is set, parts for which the test data states no symmetries have those
     of the checkpoint.
-
-    Raises:
-        UserError: The test data lacks one of the estimator's parts.
     """
     if not estimators:
         return build_parts(data)
@@ -101,34 +98,18 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
             ", ".join(names),
             "set data.root or data.parts to data of these objects",
         )
-    pairs = [(part, available[part.name]) for part in trained]
-    if data.symmetries is not None:
-        return [part for _, part in pairs]
-    return [
-        part
-        if part.has_symmetries
-        else replace(
-            part,
-            symmetries_discrete=stored.symmetries_discrete,
-            symmetries_continuous=stored.symmetries_continuous,
-        )
-        for stored, part in pairs
-    ]
+    parts = []
+    for stored in trained:
+        part = available[stored.name]
+        if data.symmetries is None and not part.has_symmetries:
+            discrete, continuous = stored.symmetries_discrete, stored.symmetries_continuous
+            part = replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
+        parts.append(part)
+    return parts
 
 
 def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
-    """Measure estimators and files of poses, or tune a checkpoint.
-
-    Args:
-        config: Config of ``evaluate.py``.
-        run_dir: Run folder.
-
-    Returns:
-        A report per method; none after tuning.
-
-    Raises:
-        UserError: An option, a file or the data is invalid.
-    """
+    """Measure estimators and files of poses; return a report per method, none after tuning."""
     program.quiet_lightning()
     options = EvaluationConfig.of(config)
     extensions.enable(options.extensions)
@@ -219,11 +200,11 @@ def _methods(
 def _check_combination(options: EvaluationConfig) -> None:
     """Raise a UserError for the first impossible combination of options."""
     has_network = options.ckpt_path is not None or options.baseline is not None
-    uses_templates, both = options.templates is not None, "both options together"
-    further = options.protocols or options.negatives is not None or uses_templates
+    templates, both = options.templates is not None, "both options together"
+    further = options.protocols or options.negatives is not None or templates
     combinations: list[tuple[bool, str, str, str]] = [
         (
-            options.ckpt_path is None and options.results is None and not uses_templates,
+            options.ckpt_path is None and options.results is None and not templates,
             "nothing to evaluate",
             "one or more of ckpt_path=…, results=… and templates=…",
             "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
@@ -236,7 +217,7 @@ def _check_combination(options: EvaluationConfig) -> None:
             "leave out refine, or add ckpt_path",
         ),
         (
-            options.scale_error is not None and options.refine is None and not uses_templates,
+            options.scale_error is not None and options.refine is None and not templates,
             f"scale_error={options.scale_error} without refine",
             both,
             "add refine=region, or leave out scale_error",
@@ -248,7 +229,7 @@ def _check_combination(options: EvaluationConfig) -> None:
             "add negatives=FOLDER, or leave out negatives_camera",
         ),
         (
-            options.negatives is not None and not has_network and not uses_templates,
+            options.negatives is not None and not has_network and not templates,
             f"negatives={options.negatives} without ckpt_path",
             both,
             "add ckpt_path, or leave out negatives (a file has no poses on these images)",
@@ -260,16 +241,10 @@ def _check_combination(options: EvaluationConfig) -> None:
             "tune first, then evaluate the tuned checkpoint with these options",
         ),
         (
-            options.tune and options.ckpt_path is None,
-            "tune=true without ckpt_path",
+            options.tune and (options.ckpt_path is None or options.baseline is not None),
+            "tune=true with a baseline or without ckpt_path",
             "one ckpt_path, and no baseline",
-            "add ckpt_path=FILE",
-        ),
-        (
-            options.tune and options.baseline is not None,
-            "tune=true with a baseline",
-            "one ckpt_path, and no baseline",
-            "leave out baseline",
+            "add ckpt_path=FILE, and leave out baseline",
         ),
     ]
     for is_impossible, problem, allowed, fix in combinations:

@@ -6,9 +6,9 @@ import logging
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -33,14 +33,13 @@ NUM_CHECKED: Final = 20  # rendered images on which the export is compared with 
 NUM_IMAGES: Final = 100  # scenes to calibrate on, and further scenes to measure on
 
 
-@dataclass(frozen=True)
-class ExportResult:
-    """A written export: path, description, agreement with the checkpoint, suggested commands."""
+class ExportResult(NamedTuple):
+    """A written export."""
 
     path: Path
     export: Export
-    agreement: ExportAgreement
-    commands: tuple[str, str]
+    agreement: ExportAgreement  # with the checkpoint
+    commands: tuple[str, str]  # to predict and to evaluate
 
 
 def export(
@@ -56,13 +55,12 @@ def export(
         path: The checkpoint.
         layout: File format, one of :data:`~dopepp.inference.export.EXPORTERS`.
         precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
-        out: Path of the export (default: next to the checkpoint, or the working directory for a
-            released checkpoint).
+        out: Path of the export; None for a path next to the checkpoint, or in the working directory
+            for a released checkpoint.
         num_images: For int8, number of rendered scenes for calibration, and of further scenes on
             which ADD-0.1d is measured.
 
     Raises:
-        UserError: The checkpoint, an option or the path is invalid, or a package is not installed.
         RunError: An fp32 export differs from the checkpoint by more than rounding, another export
             has non-finite maps, or the file cannot be written. Nothing was written.
     """

@@ -80,15 +80,9 @@ def check_resume(
 ) -> list[ConfigDifference]:
     """Return the accepted differences between a run and the config that resumes it.
 
-    Args:
-        run: Folder of the interrupted run.
-        config: Present config.
-        saved: Last checkpoint of the run.
-        payload: Description of a checkpoint of the present config.
-
-    Raises:
-        UserError: The network or the kind of optimiser differs, or the data or the loss differ and
-            ``resume_anyway`` is not set.
+    ``saved`` is the last checkpoint of the run, ``payload`` the description of a checkpoint of the
+    present config. A UserError is raised if the network or the kind of optimiser differs, or the
+    data or the loss without ``resume_anyway``.
     """
     path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
@@ -134,14 +128,13 @@ def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[C
 
 def image_differences(saved: object, present: object) -> list[ConfigDifference]:
     """Return the splits (train, val) whose descriptions in two checkpoints differ, with reasons."""
-    if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
-        return []  # the checkpoint was not written by train.py
-    return [
-        ConfigDifference(f"{split} images", ("as trained on", f"changed ({'; '.join(lines)})"))
-        for split in ("train", "val")
-        for lines in [differing_images(saved[split], present[split])]
-        if lines
-    ]
+    differences: list[ConfigDifference] = []
+    if isinstance(saved, Mapping) and isinstance(present, Mapping):  # both written by train.py
+        for split in ("train", "val"):
+            if lines := differing_images(saved[split], present[split]):
+                changed = f"changed ({'; '.join(lines)})"
+                differences.append(ConfigDifference(f"{split} images", ("as trained on", changed)))
+    return differences
 
 
 def trusted_overrides(stored: object, source: Path) -> list[str]:
@@ -149,20 +142,14 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
     A run folder is not trusted. Hydra's flags and nodes could execute arbitrary code, so they are
     not read from a folder.
-
-    Raises:
-        UserError: The stored value is not a list of overrides.
     """
-    if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
-        fix = "restore the file from backup, or start a new run"
-        raise UserError(f"{source} without a list of overrides", "key=value lines", fix)
+    texts = stored if isinstance(stored, list) else [stored]
+    matches = [_OVERRIDE.fullmatch(text) if isinstance(text, str) else None for text in texts]
     kept = []
-    for text in stored:
-        match = _OVERRIDE.fullmatch(text)
+    for text, match in zip(texts, matches, strict=True):
         if match is None:
-            problem, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
             fix = "restore the file from backup, or start a new run"
-            raise UserError(problem, allowed, fix)
+            raise UserError(f"{source} with {text!r:.100}", "a list of overrides key=value", fix)
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
@@ -206,15 +193,13 @@ def _task(hydra: object) -> object:
 
 
 def _listed(differences: Sequence[ConfigDifference]) -> str:
-    """Join differences of options into a text; without any, the number of objects differs."""
+    """Join differences of options; without any, the number of objects differs."""
     return ", ".join(map(str, differences)) or "the number of objects"
 
 
 _THUMBNAIL_SIZE: Final = (16, 12)
-_MAX_LEVELS: Final = 2.0
-"""Mean difference of two small images, in grey levels, above which they count as different."""
-_MAX_LABEL: Final = 1e-4
-"""Difference of camera matrices (relative) or poses (metres) that counts as a change."""
+_MAX_LEVELS: Final = 2.0  # smallest mean difference of two thumbnails, grey levels
+_MAX_LABEL: Final = 1e-4  # smallest change of camera matrices (relative) or poses (metres)
 _LONG: Final = 40  # maximum number of characters of a shown value
 
 
@@ -230,8 +215,7 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
     """Return descriptions of the differences between two results of :func:`describe_images`.
 
-    Descriptions of presets are ignored, because a new version may add fields to a preset. Changed
-    presets are recognised by the labels and pixels of the first image.
+    Presets are compared by the first image only, because a new version may add fields to a preset.
     """
     old, new = dict(flatten(stored["sources"])), dict(flatten(present["sources"]))
     presets = {f"{source}.preset" for source in present["sources"]}
@@ -282,13 +266,7 @@ def _shown(value: object) -> str:
 
 
 def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
-    """Warn if the parts' shapes, or the test images of equal options, differ from the checkpoint's.
-
-    Args:
-        checkpoint: Checkpoint to evaluate.
-        data: Test data; data with other options are not compared.
-        parts: Objects of the checkpoint, as defined by the test data.
-    """
+    """Warn if the parts' shapes or equally configured test images have changed since training."""
     pairs = zip(checkpoint.parts, parts, strict=True)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash and not a.has_shape_of(b)]
     if others:

@@ -103,7 +103,6 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
     Raises:
-        UserError: An option, a file or the data is invalid.
         PrunedError: A search stopped the training.
         Interruption: A signal ended the training; the message names the last checkpoint.
     """
@@ -252,10 +251,7 @@ def _announce_duration(
 
 
 def template_commands(data: DataConfig) -> list[str]:
-    """Return a command for each part that estimates poses by templates with the user's camera.
-
-    Without a camera, and for the objects of a data set, there are no commands.
-    """
+    """Return commands that estimate the parts' poses by templates with the user's camera."""
     virtual, lens = data.virtual, data.virtual.camera
     if data.root is not None or lens is None or virtual.working_distance is None:
         return []
