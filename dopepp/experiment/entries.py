@@ -176,10 +176,9 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
 def _remove_unused(run_dir: Path) -> None:
     """Remove a run folder that holds only files written before the work began."""
-    from dopepp.experiment.results.folder import DIFFERENCE, OF_THE_START
+    from dopepp.experiment.results.folder import OF_THE_START
 
-    names = {path.name for path in run_dir.iterdir()}
-    if all(name in OF_THE_START or name.startswith(DIFFERENCE) for name in names):
+    if all(path.name in OF_THE_START for path in run_dir.iterdir()):
         shutil.rmtree(run_dir)
         if not any(run_dir.parent.iterdir()):
             run_dir.parent.rmdir()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import inspect
 import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +24,8 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from dopepp.core.errors import UserError
 from dopepp.core.pool import cpu_fact
-from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.config.run_config import AUTO, RunConfig, TrainerConfig
+from dopepp.experiment.config.run_config import AUTO, RunConfig
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
@@ -236,55 +234,6 @@ def keep_freed_memory() -> None:
         libc = ctypes.CDLL(None)
         libc.mallopt(-4, 0)  # M_MMAP_MAX
         libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
-
-
-def estimate_training_s(
-    network: PoseNetwork, datamodule: PoseDataModule, trainer: TrainerConfig, precision: str
-) -> float:
-    """Estimate the duration of a run on a CPU, in seconds, from a few steps and items.
-
-    Loading and training share the cores, so their times add up. Items are loaded twice, because a
-    cache accelerates all epochs after the first epoch.
-    """
-    per_epoch = len(datamodule.train_source)
-    num_images = per_epoch * trainer.max_epochs
-    if trainer.max_steps > 0:
-        num_images = min(num_images, trainer.max_steps * datamodule.batch_size)
-    items = range(min(3, per_epoch))
-    loads = []
-    for _ in range(2):
-        start = time.perf_counter()
-        for index in items:
-            datamodule.train_item(0, index)
-        mean_s = (time.perf_counter() - start) / len(items)
-        loads.append(mean_s / max(1, torch.get_num_threads()))
-    num_first = min(num_images, per_epoch)
-    loading = loads[0] * num_first + loads[1] * (num_images - num_first)
-    return _step_s_per_image(network, datamodule, precision) * num_images + loading
-
-
-def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precision: str) -> float:
-    """Return the seconds per image of a forward and backward pass that takes at most 2 s."""
-    width, height = datamodule.input_size
-
-    def step_s(count: int) -> float:
-        images = torch.zeros(count, 3, height, width).to(memory_format=torch.channels_last)
-        start = time.perf_counter()
-        with torch.autocast("cpu", torch.bfloat16, enabled=precision.startswith("bf16")):
-            stages = network(images)
-        means = [tensor.float().mean() for stage in stages for tensor in stage]
-        torch.autograd.backward(torch.stack(means).sum())
-        return time.perf_counter() - start
-
-    network.eval()  # keeps batch norm's statistics unchanged
-    step_s(1)  # warm-up: selects kernels and allocates memory
-    single = step_s(1)
-    count = max(1, min(datamodule.batch_size, int(2 / single)))
-    step_s(count)
-    duration = step_s(count) / count
-    network.zero_grad(set_to_none=True)
-    network.train()
-    return duration
 
 
 def optimizer_factory(node: Mapping[str, Any]) -> OptimizerFactory:

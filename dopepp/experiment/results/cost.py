@@ -10,13 +10,12 @@ image plus the noise of a trained network (:data:`BELIEF_NOISE`).
 from __future__ import annotations
 
 import platform
-import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -35,12 +34,11 @@ from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
 from dopepp.experiment.results.pages import write_run_readme
-from dopepp.experiment.results.report import Cost
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator
 from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps.codec import MapGeometry
-from dopepp.models.network import build_network, network_cost
+from dopepp.models.network import network_cost
 from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
@@ -217,26 +215,6 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
         lines.append(PlotLine(f"{name}, image to poses", seconds, whole, colour, False))
         lines.append(PlotLine(f"{name}, network alone", seconds, network_rate, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames per second")))
-
-
-def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
-    """Return the cost of a spec's untrained network at ``width`` 1 and ``input_size``, pixels.
-
-    The time is the median of three forward passes on the CPU after an untimed pass.
-    """
-    widened = {
-        key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
-        for key, node in spec.items()
-    }
-    network = build_network(widened).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
-    times = []
-    with torch.inference_mode():
-        for _ in range(4):
-            start = time.perf_counter()
-            network.maps(images)
-            times.append(1000 * (time.perf_counter() - start))
-    return Cost(*network_cost(network, input_size), statistics.median(times[1:]))
 
 
 @torch.inference_mode()

@@ -29,7 +29,7 @@ from dopepp.experiment.results.frame import (
     row_values,
     values_of,
 )
-from dopepp.experiment.results.report import FULL_SIZE_COST, Cost, Report
+from dopepp.experiment.results.report import Report
 from dopepp.metrics.bootstrap import StatisticName, paired_difference
 from dopepp.metrics.pose import MEAN
 
@@ -149,14 +149,9 @@ def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 
 
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
-    """Yield the cost of a method and, for a narrowed network, the cost at full width."""
-    costs = {"": entry.cost}
-    if entry.reports and (full_size := entry.reports[0].details.get(FULL_SIZE_COST)) is not None:
-        costs["full-size "] = Cost(**full_size)
-    for prefix, cost in costs.items():
-        for measure, value in zip(COST_FORMS, vars(cost).values(), strict=True):
-            number = math.nan if value is None else float(value)
-            yield Value(entry.name, name, f"{prefix}{measure}", number)
+    """Yield the cost of a method."""
+    for measure, value in zip(COST_FORMS, vars(entry.cost).values(), strict=True):
+        yield Value(entry.name, name, measure, math.nan if value is None else float(value))
 
 
 def compact_table(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:

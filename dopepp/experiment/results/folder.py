@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -36,11 +35,9 @@ OBJECTIVE: Final = "objective"
 OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
 # Files of a run folder that are written before the work begins.
 OF_THE_START: Final = frozenset({".hydra", CONFIG_FILE, VERSIONS_FILE, "README.md"})
-DIFFERENCE: Final = "working_tree_"  # prefix of the file with uncommitted changes
 BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
 LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
-_MAX_DIFF_BYTES: Final = 10_000_000  # of larger changes, only the hash is stored
 _MAX_UNTRACKED: Final = 100
 
 
@@ -57,15 +54,13 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object of a run folder."""
+    allowed, fix = "a JSON object written by a run", "run the training or the evaluation again"
     try:
         record = read_strict_json(path)
     except UserError as error:
-        allowed = "a file written by a run"
-        fix = "run the training or the evaluation again"
         raise UserError(f"{error.got}, which cannot be read", allowed, fix) from error
     if not isinstance(record, dict):
-        fix = "run the training or the evaluation again"
-        raise UserError(f"{path}, which contains a {type(record).__name__}", "a JSON object", fix)
+        raise UserError(f"{path}, which contains a {type(record).__name__}", allowed, fix)
     return record
 
 
@@ -80,16 +75,8 @@ def write_environment(
     earlier: list[object] = []
     if path.is_file():
         latest = read_json(path)
-        previous = latest.pop("earlier", [])
-        earlier = [*(previous if isinstance(previous, list) else []), latest]
+        earlier = [*latest.pop("earlier", []), latest]
     present = environment(seed, data_fingerprint)
-    diff = _git("diff", "--binary", "HEAD")
-    if present["git"] is not None and diff:
-        digest = hashlib.sha256(diff).hexdigest()
-        present["git"]["diff_sha256"] = digest
-        if len(diff) <= _MAX_DIFF_BYTES:
-            present["git"]["diff"] = f"{DIFFERENCE}{digest[:8]}.diff"
-            write_file(run_dir / present["git"]["diff"], diff)
     write_json(path, {**present, "changes": list(changes), "earlier": earlier})
 
 

@@ -87,7 +87,7 @@ class Value(NamedTuple):
     @property
     def text(self) -> str:
         """Text for tables: ``n/a`` for a missing value, empty for a Δ that is undefined."""
-        form = COST_FORMS.get(self.measure.removeprefix("full-size "))
+        form = COST_FORMS.get(self.measure)
         if not self.measure or (self.is_change and math.isnan(self.num_differing)):
             return ""
         if form is not None:

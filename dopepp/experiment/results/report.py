@@ -11,7 +11,7 @@ import json
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,9 +21,6 @@ from dopepp.experiment.results.frame import shown_rows
 from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION
 from dopepp.metrics.row import PoseRow, mean_row
 from dopepp.parts.part import Parts
-
-FULL_SIZE_COST: Final = "full_size_cost"
-"""Key of ``details``: cost of a narrowed network at full width and input size."""
 
 Errors = dict[str, Float[np.ndarray, "instances"]]  # by object; infinite for missed instances
 

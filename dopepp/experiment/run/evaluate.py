@@ -29,7 +29,6 @@ from dopepp.experiment.results.recording import (
     refining,
 )
 from dopepp.experiment.results.report import Report
-from dopepp.experiment.run.resume import warn_of_other_images
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import is_export
@@ -101,6 +100,8 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
     parts = []
     for stored in trained:
         part = available[stored.name]
+        if stored.mesh_hash and part.mesh_hash and not part.has_shape_of(stored):
+            _log.warning("the checkpoint was trained on another shape of %s", part.name)
         if data.symmetries is None and not part.has_symmetries:
             discrete, continuous = stored.symmetries_discrete, stored.symmetries_continuous
             part = replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
@@ -130,8 +131,6 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     share = note_on_shared_folder(data)
     if share is not None:
         display.console.print(share)
-    if checkpoint is not None:
-        warn_of_other_images(checkpoint, data, parts)
     if options.tune:
         if not isinstance(loaded[0].network, PoseNetwork):
             fix = "tune the checkpoint, then export the tuned checkpoint"

@@ -27,8 +27,6 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_file
 from dopepp.core.yaml import read_yaml
 from dopepp.data.sample import DescribedSource, Sample
-from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.config.data_config import DataConfig, evaluation_data, stored_config
 from dopepp.experiment.config.run_config import RunConfig, flatten, is_below
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
@@ -39,7 +37,6 @@ from dopepp.experiment.results.folder import (
 )
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
-from dopepp.parts.part import Parts
 
 _log = logging.getLogger(__name__)
 
@@ -263,35 +260,3 @@ def _shown(value: object) -> str:
     """Return a value as text, cut after :data:`_LONG` characters."""
     text = str(value)
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"
-
-
-def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
-    """Warn if the parts' shapes or equally configured test images have changed since training."""
-    pairs = zip(checkpoint.parts, parts, strict=True)
-    others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash and not a.has_shape_of(b)]
-    if others:
-        _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
-    stored, config = checkpoint.data.get("images"), stored_config(checkpoint.data)
-    if not isinstance(stored, dict) or config is None:
-        return  # the checkpoint was not written by train.py
-    try:
-        trained_data = evaluation_data(None, None, config, "the checkpoint")
-    except UserError:
-        return  # the data config of the checkpoint cannot be read
-    if _test_set(trained_data) != _test_set(data):
-        return
-    present = describe_images(held_out_source(data, parts, "test"))
-    differences = differing_images(stored["test"], present)
-    if differences:
-        _log.warning(
-            "the test images have changed since the checkpoint was measured, although the "
-            "configuration is equal: %s",
-            "; ".join(differences),
-        )
-
-
-def _test_set(data: DataConfig) -> list[object]:
-    """Return the options of a config that define its test images."""
-    named = (data.format, data.root, data.objects, data.parts, data.unit, data.frames, data.virtual)
-    chosen = (data.image_sets, data.num_test, data.eval_seed, data.test.renderer, data.targets)
-    return [*named, *chosen, data.classes or {}]
