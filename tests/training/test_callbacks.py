@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import TQDMProgressBar
 
@@ -19,7 +18,6 @@ from dopepp.training.pose_validation import (
     AUCCurves,
     Overlays,
     PoseMetricsCallback,
-    batch_instances,
 )
 from dopepp.training.system import PoseSystem, ValidationOutput
 from dopepp.training.throughput import Throughput, make_profiler, profile_rows
@@ -99,17 +97,6 @@ def test_metrics_images_and_throughput(validate, make_system, make_datamodule, t
     lines = [r.getMessage() for r in caplog.records if "images/s" in r.getMessage()]
     assert len(lines) == len({line.partition(":")[0] for line in lines}) > 0
     assert "% of the time waiting for the loader" in lines[0]
-
-
-def test_a_batch_contains_the_instances_of_its_samples(part, batch, make_datamodule):
-    batch = replace(batch, object_index=torch.tensor([[0], [-1]]))
-    first, second = batch_instances(batch, (part,))
-    assert second == []
-    truth = make_datamodule().val_item(0, 0).instances[0]
-    assert first[0].label == truth.label
-    np.testing.assert_allclose(first[0].T_cam_obj, truth.T_cam_obj, atol=1e-6)
-    np.testing.assert_allclose(first[0].keypoints, truth.keypoints, atol=1e-4)
-    assert first[0].visible_fraction == pytest.approx(truth.visible_fraction)
 
 
 def test_a_validation_without_instances_logs_nan(validate, make_system, make_noise):

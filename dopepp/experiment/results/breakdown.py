@@ -27,12 +27,11 @@ from dopepp.experiment.results.frame import (
     Value,
     interval,
     pivot,
-    radius_note,
     rate_curves,
 )
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics, matching_radius
+from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics
 
 _log = logging.getLogger(__name__)
 
@@ -196,8 +195,7 @@ def record_breakdown(
 
     rows = pivot(values, ["condition"], cells)
     display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
-    parts = list(metrics.values())[-1].parts
-    display.console.print(radius_note({n: matching_radius(part) for n, part in parts.items()}))
+
     path = run_dir / f"by_{quantity}"
     write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], csv_cells))
     panels = {

@@ -33,13 +33,11 @@ from dopepp.experiment.results.frame import (
     heading,
     markdown,
     pivot,
-    radius_note,
     rate_curves,
     row_values,
     shown_rows,
 )
 from dopepp.experiment.results.measurement import (
-    FileMethod,
     Measured,
     Method,
     accumulators,
@@ -62,7 +60,6 @@ _FIELDS: Final = (
 )  # fmt: skip
 _LABELS: Final = ("method", "object")
 _MARGIN: Final = 0.3  # around shaded objects on the sheet of examples, share of their extent
-_NOTABLE: Final = 0.05  # smallest change of the mean visible fraction that a note mentions
 
 
 @dataclass(frozen=True)
@@ -74,23 +71,12 @@ class Condition:
     level: str  # column of the levels in the CSV file
     form: str  # format of a level in the unit of the axis
     introduction: str  # beginning of the page
-    images: str  # description of the levels' images, for error messages
     per_unit: float = 1.0  # converts a level to the unit of the axis
     ratio: bool = False  # levels are ratios, which need a logarithmic axis
 
     def heading(self, level: float) -> str:
         """Return the column heading of a level, such as ``40 %``."""
         return self.form.format(self.per_unit * level)
-
-    def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Check that all methods are estimators: a file has no poses on the changed images."""
-        for name, method in methods.items():
-            if isinstance(method, FileMethod):
-                raise UserError(
-                    f"{self.name} with results of {name}, which has no poses on {self.images}",
-                    "checkpoints (ckpt_path, baseline)",
-                    f"leave out {self.name} or results",
-                )
 
 
 SHADING: Final = Condition(
@@ -102,7 +88,6 @@ SHADING: Final = Condition(
 
 Columns: the share of every object's visible pixels that is covered by patches of the image's
 background (paper Table 3). Instances are selected before the shading.""",
-    images="images with patches",
     per_unit=100,
 )
 
@@ -116,7 +101,6 @@ SCALE: Final = Condition(
 Columns: the apparent size of the parts relative to the test set (paper Fig. 11). The camera moves
 along its ray to the parts and divides their distance by this factor; the scenes are unchanged.
 Instances with at least 10 % visible from the moved camera are evaluated.""",
-    images="images of the moved camera",
     ratio=True,
 )
 
@@ -162,11 +146,7 @@ def record_condition(
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
-    radii = {row.object: row.matching_radius for row in rows if row.matching_radius}
-    radii.pop(MEAN, None)
-    if radii:
-        notes.append(radius_note(radii))
-        display.console.print(notes[-1])
+
     path = run_dir / f"{condition.name}.md"
     write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), csv_cells))
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
@@ -329,7 +309,7 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
     note = (
         f"Evaluated instances at {SCALE.heading(scale)}: {_in_words(visible)}; "
         f"at {SCALE.heading(1)}: {_in_words(reference)}."
-        if len(visible) != len(reference) or abs(mean - reference.mean()) > _NOTABLE
+        if len(visible) != len(reference) or abs(mean - reference.mean()) > 0.05
         else ""
     )
     return Level(scale, rows, {"visible_fraction": mean}, note)

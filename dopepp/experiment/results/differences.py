@@ -25,7 +25,6 @@ from dopepp.experiment.results.frame import (
     make_frame,
     means,
     pivot,
-    radius_note,
     row_values,
     values_of,
 )
@@ -200,8 +199,7 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
     """Return sentences that explain the table: baseline, intervals, noise and narrowed networks."""
     sentences: list[str] = []
     measured = [entry for entry in entries if entry.reports]
-    if measured and (radii := measured[0].reports[0].matching_radii):
-        sentences.append(radius_note(radii))
+
     networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
         sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(table))

@@ -83,6 +83,8 @@ def write_environment(
 def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
     """Return time, command, versions, git state, hardware, seed and data hash as JSON values."""
     gpus = map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
+    is_posix = hasattr(os, "sysconf")
+    memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if is_posix else None
     return {
         "dopepp": dopepp.__version__,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -94,7 +96,7 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
             "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
-            "memory_bytes": _memory_bytes(),
+            "memory_bytes": memory_bytes,
             "gpus": [{"name": gpu.name, "memory_bytes": gpu.total_memory} for gpu in gpus],
             "cuda": torch.version.cuda,
         },
@@ -111,14 +113,6 @@ def _packages() -> dict[str, str]:
     headers = (package.metadata for package in distributions())  # parsed at every access
     versions = [(header["Name"], header["Version"]) for header in headers if "Name" in header]
     return dict(sorted(versions, key=lambda version: version[0].lower()))
-
-
-def _memory_bytes() -> int | None:
-    """Return the size of the machine's memory, or None if the system does not report it."""
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError):
-        return None
 
 
 def _git(*arguments: str) -> bytes | None:

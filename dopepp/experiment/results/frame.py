@@ -207,12 +207,6 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def radius_note(radii: Mapping[str, float]) -> str:
-    """Return a sentence with the matching radius of each object, given in metres by name."""
-    listed = ", ".join(f"{name} {1000 * radius:.0f} mm" for name, radius in radii.items())
-    return f"Matching radius, half a diameter and at most 10 cm: {listed}."
-
-
 def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, RateCurve]:
     """Return a curve for each method: the rate against the condition multiplied by ``per_unit``."""
     points: dict[str, list[tuple[float, ...]]] = {}

@@ -95,11 +95,6 @@ class EstimatorMethod:
         seconds = time.perf_counter() - start
         return [candidate for candidate in candidates if candidate.object in self._names], seconds
 
-    @property
-    def takes_views(self) -> bool:
-        """Whether the estimator accepts several views: its refinement verifies poses."""
-        return self.estimator.refiner is not None and self.estimator.refiner.verifies
-
     def rejection(self, sample: Sample) -> Reason | None:
         """Return why the best candidate in an image without detections was rejected, if any."""
         reasons = main_reasons(

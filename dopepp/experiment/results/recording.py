@@ -91,15 +91,13 @@ def measure_and_record(
     methods |= files
     # Impossible protocols are rejected before anything is measured.
     if protocols.shading:
-        conditions.SHADING.check_methods(methods)
         conditions.check_masks(source)
-    if protocols.scales:
-        conditions.SCALE.check_methods(methods)
     scaled = {scale: scaled_test_renders(data, parts, scale) for scale in protocols.scales}
-    views = {
-        f"{name}, {data.views} views": ViewsMethod(method.estimator, parts)
-        for name, method in methods.items()
-        if data.views > 1 and isinstance(method, EstimatorMethod) and method.takes_views
+    detectors = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
+    views = {  # poses of several views need a refinement that verifies them
+        f"{name}, {data.views} views": ViewsMethod(estimator, parts)
+        for name, estimator in detectors.items()
+        if data.views > 1 and estimator.refiner is not None and estimator.refiner.verifies
     }
     if views:
         source = with_views(source, data.views)
@@ -121,7 +119,7 @@ def measure_and_record(
     main.details.update(details or {})
     _record_coverage(run_dir, measured)
     if without_parts is not None:
-        _record_false_alarms(run_dir, methods, reports, without_parts)
+        _record_false_alarms(run_dir, detectors, reports, without_parts)
     if refines:
         main.refined = reports[-1]
     write_json(run_dir / METRICS_FILE, main.to_record())
@@ -183,11 +181,13 @@ def _record_coverage(run_dir: Path, measured: Measured) -> None:
 
 
 def _record_false_alarms(
-    run_dir: Path, methods: Mapping[str, Method], reports: Sequence[Report], frames: SampleSource
+    run_dir: Path,
+    estimators: Mapping[str, PoseEstimator],
+    reports: Sequence[Report],
+    frames: SampleSource,
 ) -> None:
-    """Measure the estimators on images without their parts, and add the counts to the reports."""
-    of_methods = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
-    alarms, tiles = count_false_alarms(of_methods, frames)
+    """Measure estimators on images without their parts, and add the counts to the reports."""
+    alarms, tiles = count_false_alarms(estimators, frames)
     for report in reports:
         report.details[KEY] = asdict(alarms[report.name])
     display.show_table(TITLE, [alarm.row(name) for name, alarm in alarms.items()])

@@ -64,12 +64,6 @@ class Report:
             for name, row in shown_rows(self.rows).items()
         }
 
-    @property
-    def matching_radii(self) -> dict[str, float]:
-        """Largest distance between matching centres (matching radius) by object, metres."""
-        radii = {name: row.matching_radius for name, row in self.rows.items() if name != MEAN}
-        return {name: radius for name, radius in radii.items() if radius is not None}
-
     def to_record(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
         return {

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from rich.table import Table
 
 from dopepp.core import extensions
 from dopepp.core.errors import UserError
@@ -64,12 +63,15 @@ def tune_and_record(
 def _show(tuning: Tuning, path: Path) -> None:
     """Print the effect of tuning on test images, the tuned options and the new path."""
     shown, empty = tuning.num_images
-    title = f"tuned; measured on {shown} test images and {empty} without objects"
-    table = Table("", "network before", "after", title=title)
-    for name, before in vars(tuning.before).items():
-        after = getattr(tuning.after, name)
-        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
-    display.console.print(table)
+    rows = [
+        {
+            "": f"{name.replace('_', ' ')} %",
+            "network before": f"{100 * before:.1f}",
+            "after": f"{100 * getattr(tuning.after, name):.1f}",
+        }
+        for name, before in vars(tuning.before).items()
+    ]
+    display.show_table(f"tuned; measured on {shown} test images and {empty} without objects", rows)
     for name, value in tuning.options.items():
         display.console.print(f"recovery.{name}: {value:.4g}")
     if tuning.kept:
@@ -200,7 +202,9 @@ def _check_combination(options: EvaluationConfig) -> None:
     """Raise a UserError for the first impossible combination of options."""
     has_network = options.ckpt_path is not None or options.baseline is not None
     templates, both = options.templates is not None, "both options together"
-    further = options.protocols or options.negatives is not None or templates
+    protocols = options.protocols
+    changes_images = bool(protocols.shading or protocols.scales)
+    further = protocols or options.negatives is not None or templates
     combinations: list[tuple[bool, str, str, str]] = [
         (
             options.ckpt_path is None and options.results is None and not templates,
@@ -232,6 +236,12 @@ def _check_combination(options: EvaluationConfig) -> None:
             f"negatives={options.negatives} without ckpt_path",
             both,
             "add ckpt_path, or leave out negatives (a file has no poses on these images)",
+        ),
+        (
+            options.results is not None and changes_images,
+            f"shading or scale with results={options.results}, which has no poses on these images",
+            "checkpoints (ckpt_path, baseline)",
+            "leave out shading and scale, or results",
         ),
         (
             options.tune and bool(further),

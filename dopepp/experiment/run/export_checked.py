@@ -14,7 +14,7 @@ import numpy as np
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import draft
-from dopepp.data.sample import Sample, SampleSource
+from dopepp.data.sample import SampleSource
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.config.data_config import stored_config
 from dopepp.experiment.program import entry_command
@@ -77,7 +77,9 @@ def export(
     if precision == "int8":
         _log.info("rendering %d validation scenes to calibrate on", num_images)
         for index in range(num_images, 2 * num_images):
-            images += _network_inputs(original, source.sample(index))
+            sample = source.sample(index)
+            for view in original.views(sample.image, sample.K):
+                images.append(np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]))
     save = EXPORTERS[layout][0](network, precision, images)
     described = Export(layout, precision, network.size_multiple, *cost)
     with _draft_output(target) as draft_path:
@@ -132,12 +134,6 @@ def _output_path(path: Path, layout: str, precision: str, out: Path | None) -> P
         fix = "pass another path with --out"
         raise UserError(f"--out {out}, which is the checkpoint", "the path of another file", fix)
     return out
-
-
-def _network_inputs(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
-    """Return the network's inputs for an image, each of shape (1, 3, height, width)."""
-    views = estimator.views(sample.image, sample.K)
-    return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
 
 
 def _accuracy(

@@ -106,7 +106,9 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
             report = _train(config, run_dir, readme, trackers)
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
-        advice = _advice(run_dir)
+        step = saved_step(run_dir / LAST_CHECKPOINT)
+        saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
+        advice = f"{saved}; continue with resume={run_dir}"
         readme.end(pages.INTERRUPTED, advice)
         raise Interruption(number, advice) from interrupt
     except PrunedError as pruned:
@@ -253,13 +255,6 @@ def _resume_path(
         return None, []
     path, checkpoint = newest
     return path, check_resume(run_dir, config, checkpoint, system.payload)
-
-
-def _advice(run_dir: Path) -> str:
-    """Return a text with the last saved step of an interrupted run, and how to resume it."""
-    step = saved_step(run_dir / LAST_CHECKPOINT)
-    saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
-    return f"{saved}; continue with resume={run_dir}"
 
 
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:

@@ -11,7 +11,6 @@ from dopepp.experiment.results.folder import (
     read_json,
     write_environment,
 )
-from dopepp.virtual.factory import code_hash
 
 
 @pytest.fixture
@@ -54,13 +53,3 @@ def test_a_resumed_run_keeps_its_earlier_environments(tmp_path):
         (1, []), (2, ["seed: 1 → 2"]),
     ]  # fmt: skip
     assert all("earlier" not in item for item in written["earlier"])
-
-
-def test_packages_hardware_and_code():
-    facts = environment(7, "abc")
-    assert facts["rendering_code"] == code_hash()
-    assert {"torch", "lightning", "numpy", "hydra-core"} <= set(facts["packages"])
-    assert all(facts["packages"].values())
-    assert facts["hardware"]["cores"] >= facts["hardware"]["threads"] >= 1
-    assert facts["hardware"]["processor"]
-    assert facts["hardware"]["memory_bytes"] > 2**28

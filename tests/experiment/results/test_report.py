@@ -87,25 +87,14 @@ def test_equal_images_have_equal_fingerprints():
 INSTANCE = sample().instances[0]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        *(
-            {"instances": [replace(INSTANCE, **fields)]}
-            for fields in (
-                {"T_cam_obj": INSTANCE.T_cam_obj + 1e-4},
-                {"label": "servoholder"},
-                {"visible_fraction": 0.05},
-                {"masked_fraction": 0.4},
-            )
-        ),
-        {"instances": []},
-        {"key": "0/2"},
-        {"source": "photoreal"},
-        {"K": np.diag([606.0, 606.0, 1.0])},
-        {"image": np.zeros((6, 4, 3), np.uint8)},
-    ],
-)
+@pytest.mark.parametrize("change", [
+    *({"instances": [replace(INSTANCE, **fields)]} for fields in (
+        {"T_cam_obj": INSTANCE.T_cam_obj + 1e-4}, {"label": "servoholder"},
+        {"visible_fraction": 0.05}, {"masked_fraction": 0.4},
+    )),
+    {"instances": []}, {"key": "0/2"}, {"source": "photoreal"},
+    {"K": np.diag([606.0, 606.0, 1.0])}, {"image": np.zeros((6, 4, 3), np.uint8)},
+])  # fmt: skip
 def test_changed_images_have_other_fingerprints(change):
     assert hash_of(sample()) != hash_of(replace(sample(), **change))
 

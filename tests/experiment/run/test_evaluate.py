@@ -35,7 +35,6 @@ def test_refined_poses_are_measured_in_addition(evaluate, tmp_path):
     curve = written["refined"]["coverage_curve"]["pivconnector"]
     assert curve["observed"][curve["nominal"].index(0.9)] == refined.mean.coverage
     assert (run / "coverage.png").is_file()
-    assert "Matching radius, half a diameter" in (run / "compare.md").read_text()
 
 
 def test_a_small_scale_error_improves_the_distance(evaluate):
@@ -99,6 +98,7 @@ def test_detections_on_images_without_the_part_are_counted(evaluate, tmp_path, c
     [
         ("ckpt_path=x negatives_camera=y", "negatives_camera=y without negatives"),
         ("results=x negatives=y", "negatives=y without ckpt_path"),
+        ("results=x scale_factors=2", "shading or scale with results=x, which has no"),
         ("ckpt_path=x scale_error=0.01", "scale_error=0.01 without refine"),
         ("ckpt_path=x refine=region scale_error=0.2", "scale_error=0.2"),
         ("ckpt_path=x tune=true negatives=y", "tune=true with shading, scale, by, neg"),
