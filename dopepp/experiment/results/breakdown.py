@@ -195,7 +195,6 @@ def record_breakdown(
 
     rows = pivot(values, ["condition"], cells)
     display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
-
     path = run_dir / f"by_{quantity}"
     write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], csv_cells))
     panels = {

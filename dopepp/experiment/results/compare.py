@@ -155,8 +155,7 @@ def compare_runs(
     entries = with_refined(networks)
     page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
-    shown = num_pictures if any(entry.reports for entry in networks) else 0
-    tiles, missing = image_tiles(networks, shown) if shown else ([], "")
+    tiles, missing = image_tiles(networks, num_pictures)
     if tiles:
         write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
         width = 2 * max([panel.shape[1] for panel in panels], default=768)
@@ -215,7 +214,7 @@ def read_log_column(path: Path, column: str) -> dict[int, float]:
     return {step: number for step, number in numbers.items() if math.isfinite(number)}
 
 
-def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
+def image_tiles(entries: Sequence[Entry], num: int) -> tuple[list[Tile], str]:
     """Draw the predictions of all methods on the first ``num`` test images.
 
     The images are from the first method whose test set can be opened. The first seed of each method
@@ -225,7 +224,7 @@ def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list
         Tiles row by row (one row per image, one tile per method), and why images are missing.
     """
     measured = [run for entry in entries for run in entry.runs if run.report]
-    kinds = list(dict.fromkeys(map(_parts, measured))) or [()]
+    kinds = list(dict.fromkeys(map(_parts, measured)))[:num]
     tiles, notes = [], []
     for number, parts in enumerate(kinds):
         share = num // len(kinds) + (number < num % len(kinds))
@@ -294,18 +293,17 @@ class _Model:
 
 def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
     """Draw a tile per image and method; return the tiles, and the reason if there are none."""
-    reasons = [f"{model.name}: {model.reason}" for model in models]
     loaded = [model for model in models if model.estimator is not None]
     samples: list[Sample] = []
-    for number, model in enumerate(loaded):
-        reasons = reasons if number else []
+    reasons = [] if loaded else [f"{model.name}: {model.reason}" for model in models]
+    for model in loaded:
         try:
             samples = model.test_images(num)
             break
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        return [], f"Predictions cannot be displayed. {'; '.join(reasons)}" if num else ""
+        return [], f"Predictions cannot be displayed. {'; '.join(reasons)}"
     return [
         model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
         for sample in samples

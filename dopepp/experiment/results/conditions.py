@@ -146,7 +146,6 @@ def record_condition(
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
-
     path = run_dir / f"{condition.name}.md"
     write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), csv_cells))
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]

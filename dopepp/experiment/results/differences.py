@@ -199,7 +199,6 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
     """Return sentences that explain the table: baseline, intervals, noise and narrowed networks."""
     sentences: list[str] = []
     measured = [entry for entry in entries if entry.reports]
-
     networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
         sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(table))

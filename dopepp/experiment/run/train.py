@@ -168,7 +168,6 @@ def _train(
         for tracker in trackers:
             tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
-
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:

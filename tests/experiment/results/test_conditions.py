@@ -155,7 +155,6 @@ def test_impossible_conditions_are_rejected_early(tiny):
     check_masks(discs())
     with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
         check_masks(discs(masks=False))
-
     data = replace(tiny().data, root=Path("photos"))
     with pytest.raises(UserError, match=r"scale=2 on the images in data\.root=") as error:
         scaled_test_renders(data, [], 2.0)

@@ -88,7 +88,6 @@ def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden):
         errors = rng.gamma(1, 0.01 if model == "dope" else 0.004, 60)
         overrides = [f"model={model}", f"seed={seed}", "data=virtual"]
         result = report_of(model, {"bolt": errors, "nut": errors[::-1] * 1.01}, refined=errors / 2)
-
         write_run(Path("sweep", str(number)), overrides, result)
     write_run(Path("sweep", "4"), ["model=other", "seed=1"], "got x=[1] | y; allowed: [2]; fix: z")
     write_json(write_run(Path("sweep", "5"), ["model=p"]) / "pruned.json", {"reason": "bad"})
