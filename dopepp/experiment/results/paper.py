@@ -157,7 +157,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
     if not table.paper:
         notes.append("The paper has no table of these values.")
     rows, doubts = KINDS[table.kind](table, table.methods(entries), folder)
-    display.show_table(title, rows, num_labels=sum(heading in _LABELS for heading in rows[0]))
+    display.show_table(title, rows, num_labels=sum(key in _LABELS for key in rows[0]))
     write_csv(folder / TABLE_FILE, rows, header_of(rows))
     table_and_notes = {"table": markdown(rows), "notes": [*notes, *doubts]}
     write_page(folder / TEXT_FILE, "table", title=title, **table_and_notes)
