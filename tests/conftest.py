@@ -119,21 +119,12 @@ class Done(NamedTuple):
 def call():
     """Run an entry point inside this process, ten times faster than as one of its own.
 
-    It must end with ``code``; what a full-size network costs is measured once, on small images.
+    It must end with ``code``.
     """
-    costs: dict[str, Any] = {}
-
-    def cost(spec: Any, input_size: Any) -> Any:
-        from dopepp.experiment.results.cost import full_size_cost
-
-        if str(spec) not in costs:
-            costs[str(spec)] = full_size_cost(spec, (64, 64))
-        return costs[str(spec)]
 
     def run(script: str, *arguments: str, code: int | None = None) -> Done:
         path, out, err, ended = str(ROOT / script), io.StringIO(), io.StringIO(), 0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("dopepp.experiment.run.train.full_size_cost", cost)
             patch.setattr(sys, "argv", [path, *arguments])
             patch.setenv("HYDRA_FULL_ERROR", "1")  # the entry point sets it: undone here
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -43,33 +43,27 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
         open_nodes: Config nodes that accept keys missing in ``conf/``, which are checked later.
         short_names: Full option name by short name.
         num_words: Number of words before the overrides: 1 for ``train.py``, 2 for ``dopepp train``.
-
-    Raises:
-        UserError: ``hydra.run.dir`` contains another run, or the run to resume is unreadable.
     """
-    words, given = sys.argv[:num_words], sys.argv[num_words:]
-    arguments = [_spelled_out(text, short_names, open_nodes) for text in given]
+    words, arguments = sys.argv[:num_words], []
+    for argument in sys.argv[num_words:]:
+        key, equals, value = argument.partition("=")
+        named = f"{short_names.get(key, key)}{equals}{value}"
+        is_inside = named.startswith(tuple(f"{node}." for node in open_nodes))
+        arguments.append(f"++{named}" if is_inside else named)
     begun = multirun.requeued_run([*words[1:], *arguments])
     if begun is not None:
         arguments.append(f"resume={begun}")
-    _refuse_used_folder(arguments)
-    sys.argv = [*words, *_resumed(arguments)]
+    given = dict(text.partition("=")[::2] for text in arguments)
+    resume, folder = given.get("resume", "null"), given.get("hydra.run.dir", "")
+    if resume not in ("", "null"):
+        arguments = _resumed(arguments, Path(resume))
+    elif folder:
+        _refuse_used_folder(folder)
+    sys.argv = [*words, *arguments]
 
 
-def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequence[str]) -> str:
-    """Expand a short name in ``key=value``, and put ``++`` before keys below ``open_nodes``."""
-    key, equals, value = argument.partition("=")
-    named = f"{short_names.get(key, key)}{equals}{value}"
-    inside = named.startswith(tuple(f"{node}." for node in open_nodes))
-    return f"++{named}" if inside else named
-
-
-def _refuse_used_folder(arguments: Sequence[str]) -> None:
-    """Raise an error if ``hydra.run.dir`` already contains a run and no run is resumed."""
-    words = dict(text.partition("=")[::2] for text in arguments)
-    folder = words.get("hydra.run.dir", "")
-    if not folder or words.get("resume", "null") not in ("", "null"):
-        return
+def _refuse_used_folder(folder: str) -> None:
+    """Raise an error if the value of ``hydra.run.dir`` already contains a run."""
     from dopepp.experiment.results.folder import VERSIONS_FILE
 
     # Processes of higher rank receive the folder that rank 0 has created.
@@ -81,14 +75,10 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
         )
 
 
-def _resumed(arguments: list[str]) -> list[str]:
-    """For ``resume=RUN``, add the stored overrides of RUN and make RUN the run folder."""
-    runs = [text.partition("=")[2] for text in arguments if text.startswith("resume=")]
-    if not runs or runs[-1] in ("", "null"):
-        return arguments
+def _resumed(arguments: list[str], run: Path) -> list[str]:
+    """Add the stored overrides of the resumed ``run``, which becomes the run folder."""
     from dopepp.experiment.run.resume import read_overrides
 
-    run = Path(runs[-1])
     overrides = read_overrides(run)
     if overrides is None:
         return arguments  # the run reports the problem with the folder
@@ -138,15 +128,10 @@ def _flat(node: DictConfig, prefix: str = "") -> Iterator[str]:
 
 
 def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:
-    """Return the completions of an incomplete word for a shell.
+    """Return the completions of the word at the cursor for a shell, after ``words``.
 
     A single matching key is completed to its values, because a shell adds a space to a single
     match. After the word ``=``, only values are returned, because Bash splits words at ``=``.
-
-    Args:
-        name: ``train`` or ``evaluate``.
-        words: Words of the command line before the incomplete word.
-        incomplete: Beginning of the word at the cursor; may be empty.
     """
     line = re.sub(r" ?= ?", "=", " ".join([*words, incomplete]))
     is_value = list(words[-1:]) == ["="]

@@ -97,10 +97,7 @@ def entry(
     short_names: Mapping[str, str] | None = None,
     num_words: int = 1,
 ) -> None:
-    """Run ``main``, which passes ``sys.argv`` to Hydra; exit with one line on an expected error.
-
-    The remaining arguments are as in :func:`~dopepp.experiment.command_line.prepare`.
-    """
+    """Run ``main``, which passes ``sys.argv`` to Hydra; exit with one line on an expected error."""
     # With this variable Hydra raises its errors instead of printing pages of text.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     program.configure_logging()
@@ -179,10 +176,9 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
 def _remove_unused(run_dir: Path) -> None:
     """Remove a run folder that holds only files written before the work began."""
-    from dopepp.experiment.results.folder import DIFFERENCE, OF_THE_START
+    from dopepp.experiment.results.folder import OF_THE_START
 
-    names = {path.name for path in run_dir.iterdir()}
-    if all(name in OF_THE_START or name.startswith(DIFFERENCE) for name in names):
+    if all(path.name in OF_THE_START for path in run_dir.iterdir()):
         shutil.rmtree(run_dir)
         if not any(run_dir.parent.iterdir()):
             run_dir.parent.rmdir()

@@ -58,8 +58,8 @@ def configure_logging() -> None:
 def quiet_lightning() -> None:
     """Suppress Lightning's log messages below WARNING; call after the import of Lightning.
 
-    Two warnings are suppressed as well: the use of ``LeafSpec`` in Lightning 2.6, which PyTorch 2.9
-    deprecates, and layers in evaluation mode, which are the frozen layers of a backbone.
+    Two warnings are suppressed as well: Lightning's use of the deprecated ``LeafSpec``, and
+    layers in evaluation mode, which are the frozen layers of a backbone.
     """
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
     warnings.filterwarnings(

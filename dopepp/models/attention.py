@@ -52,12 +52,9 @@ class SE(Attention):
 class CBAM(Attention):
     """Attention of DOPE++ (Eq. 5, 6): channel attention, then spatial attention.
 
-    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map (Eq. 5). Spatial: features ·
-    σ(conv([mean; maximum])) over the channels (Eq. 6). ``reduction`` divides the width of the MLP's
-    hidden layer; ``kernel_size`` is the size of the spatial convolution.
-
-    Raises:
-        UserError: The kernel size is even, or not in 1 to 31.
+    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map. Spatial: features ·
+    σ(conv([mean; maximum])) over the channels. ``reduction`` divides the MLP's hidden width;
+    ``kernel_size`` of the convolution is odd.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:

@@ -36,17 +36,11 @@ Plan = tuple[int, ...]  # Channels of convolutions, POOL for poolings
 
 
 class Backbone(nn.Module, ABC):
-    """Base class of backbones.
-
-    Attributes:
-        out_channels: Channels of the feature maps.
-        stride: Input pixels per feature cell, along each axis.
-        cell_multiple: The feature map's height and width must be multiples of this number.
-    """
+    """Base class of backbones."""
 
     out_channels: int
-    stride: int = 8
-    cell_multiple: int = 1
+    stride: int = 8  # input pixels per feature cell, along each axis
+    cell_multiple: int = 1  # the feature map's height and width are multiples of this number
 
     @abstractmethod
     def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
@@ -86,9 +80,6 @@ class VGG19(_Chain):
         batch_norm: Whether batch norm replaces the bias of every convolution.
         weights_path: File with a ``state_dict`` of torchvision's ``vgg19`` that initialises the VGG
             layers. Checkpoints do not store this path.
-
-    Raises:
-        UserError: An argument is out of range, or the file does not match the layers.
     """
 
     plan: ClassVar[Plan] = (64, 64, POOL, 128, 128, POOL, 256, 256, 256, 256, POOL, 512, 512)
@@ -129,8 +120,7 @@ class DSC(_Chain):
     """DOPE++'s light backbone of depthwise separable convolutions (Fig. 7).
 
     A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
-    each. Three poolings reduce 416×416 pixels to 52×52 cells of 128 channels. ``width`` and
-    ``batch_norm`` are as in :class:`VGG19`.
+    each. Three poolings reduce 416×416 pixels to 52×52 cells of 128 channels.
     """
 
     plan: ClassVar[Plan] = (
@@ -153,9 +143,8 @@ class Pyramid(Backbone):
 
     The backbone is fast on CPUs: no layer works at full resolution, and no 3×3 convolution is
     depthwise. 4×4 pixels become 48 channels (Shi et al. 2016), followed by a 3×3 convolution and
-    the residual blocks (He et al. 2016) of each stride. From stride 32 to stride 8, a 1×1
-    convolution and upsampling by 2 precede the sum with the finer features (Lin et al. 2017) and
-    further residual blocks. Every convolution has batch norm.
+    the residual blocks (He et al. 2016) of each stride. A 1×1 convolution and upsampling by 2
+    precede each sum with finer features (Lin et al. 2017). Every convolution has batch norm.
 
     Args:
         channels: Channels at strides 4, 8, 16 and 32, each 8–1024.
@@ -216,13 +205,7 @@ class Pyramid(Backbone):
 def copy_layer(
     weights: Mapping[str, object], name: str, layer: nn.Module, path: str, network: str
 ) -> None:
-    """Copy the weights of a file to a layer, whose name in the file is ``name``.
-
-    ``path`` of the file and the name of the expected ``network`` are for messages.
-
-    Raises:
-        UserError: A tensor is missing or has a different shape.
-    """
+    """Copy the weights called ``name`` in a file to a layer; the texts are for messages."""
     for key, parameter in layer.state_dict().items():
         value = weights.get(f"{name}.{key}")
         if not isinstance(value, Tensor) or value.shape != parameter.shape:

@@ -26,13 +26,10 @@ from dopepp.models.storage import (
     check_container,
     read_mapping,
     read_safetensors,
-    write_atomic,
     write_safetensors,
 )
 from dopepp.parts.part import Part
 from dopepp.parts.size import LearnedRange
-
-__all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
 
 KEY: Final = "dopepp"  # Key of the description in files of both kinds
 
@@ -58,38 +55,21 @@ _FIX: Final = "use a checkpoint written by train.py"
 
 @dataclass(eq=False)
 class Checkpoint:
-    """A trained network with everything needed to use it.
+    """A trained network with everything needed to use it."""
 
-    Attributes:
-        spec: The network's spec (:mod:`dopepp.models.network`), without ``weights_path``.
-        state_dict: The network's weights, without prefix.
-        parts: The objects, in channel order.
-        input_size: (width, height) of training images, pixels.
-        stride: Pixels per map cell.
-        sigma: Standard deviation of the belief targets, cells.
-        recovery: Thresholds of the recovery of detections from maps, by option.
-        data: The data and camera configuration of the training.
-        data_fingerprint: Hash of everything that determines the training data.
-        seen: Ranges of diameter (pixels) and depth (metres) in the training data, by part name.
-    """
-
-    spec: dict[str, Any]
-    state_dict: dict[str, Tensor]
-    parts: list[Part]
-    input_size: tuple[int, int]
-    stride: int
-    sigma: float
-    recovery: dict[str, float] = field(default_factory=dict)
-    data: dict[str, Any] = field(default_factory=dict)
-    data_fingerprint: str = ""
-    seen: dict[str, LearnedRange] = field(default_factory=dict)
+    spec: dict[str, Any]  # of `dopepp.models.network`, without `weights_path`
+    state_dict: dict[str, Tensor]  # weights by name, without prefix
+    parts: list[Part]  # in channel order
+    input_size: tuple[int, int]  # (width, height) of training images, pixels
+    stride: int  # pixels per map cell
+    sigma: float  # standard deviation of the belief targets, cells
+    recovery: dict[str, float] = field(default_factory=dict)  # options, as of RecoveryOptions
+    data: dict[str, Any] = field(default_factory=dict)  # data and camera configuration
+    data_fingerprint: str = ""  # hash of everything that determines the training data
+    seen: dict[str, LearnedRange] = field(default_factory=dict)  # trained sizes, by part name
 
     def to_payload(self) -> dict[str, Any]:
-        """Return the description as JSON values, for the file's ``dopepp`` key.
-
-        Raises:
-            TypeError: A value is neither a JSON value nor a numpy scalar or array.
-        """
+        """Return the description as JSON values; a ``TypeError`` rejects other values."""
         names = ("input_size", "stride", "sigma", "recovery", "data", "data_fingerprint", "seen")
         values = {
             "format_version": FORMAT_VERSION,
@@ -161,11 +141,7 @@ def load_network(path: Path) -> tuple[PoseNetwork, Checkpoint]:
 
 
 def parse_description(payload: object) -> Checkpoint:
-    """Parse the result of :meth:`Checkpoint.to_payload` into a checkpoint without weights.
-
-    Raises:
-        UserError: A field is missing, of the wrong type or out of range.
-    """
+    """Parse the result of :meth:`Checkpoint.to_payload` into a checkpoint without weights."""
     if not isinstance(payload, dict):
         problem = f"a description of type {type(payload).__name__}"
         raise UserError(problem, "a mapping", "train the network again")
@@ -265,11 +241,7 @@ def released_paths() -> dict[str, Path]:
 
 
 def find(path: Path) -> Path:
-    """Return the file that a path or ``pretrained/NAME`` refers to.
-
-    Raises:
-        UserError: No released checkpoint has this name.
-    """
+    """Return the file that a path or ``pretrained/NAME``, a released checkpoint, refers to."""
     if path.parent != Path(FOLDER) or path.exists():
         return path
     released = released_paths()
@@ -296,12 +268,9 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> None:
-    """Write the result of :meth:`Checkpoint.to_file` as safetensors, without local paths.
+    """Write the result of :meth:`Checkpoint.to_file` as safetensors, in float16 if ``half``.
 
-    Weights are float16 if ``half``.
-
-    Raises:
-        UserError: A weight does not fit into half precision.
+    Local paths are left out. Weights beyond half precision raise a UserError.
     """
     weights = content["state_dict"]
     if half:
@@ -327,11 +296,7 @@ def _half(name: str, value: Tensor) -> Tensor:
 
 
 def _without_folders(value: Any, key: str = "") -> Any:
-    """Return a description without local paths.
-
-    A path is replaced by the name of its file, and a folder under a key of :data:`_FOLDER_KEYS`
-    by None.
-    """
+    """Return a description without local paths: file names for files, None for folders."""
     if isinstance(value, Mapping):
         return {name: _without_folders(item, name) for name, item in value.items()}
     if isinstance(value, list):

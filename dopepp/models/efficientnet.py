@@ -53,13 +53,8 @@ class EfficientNetLite(Backbone):
         top_down: Number of residual blocks after the sums at strides 16 and 8, each 0–16.
         width: Multiplier of ``channels``; the encoder's channels are fixed.
         frozen: Stride down to which the encoder is frozen, 8, 16 or 32; 0 freezes no layer.
-        weights_path: File with a ``state_dict`` in EfficientNet-PyTorch's names that initialises
-            the encoder, or ``imagenet`` for the ImageNet weights that the extra ``imagenet``
-            installs. Checkpoints do not store the path.
-
-    Raises:
-        UserError: An argument is out of range, the extra is not installed, or the file does not
-            match the encoder.
+        weights_path: File with a ``state_dict`` in EfficientNet-PyTorch's names, or ``imagenet``
+            for the weights that the extra ``imagenet`` installs. Checkpoints do not store it.
     """
 
     cell_multiple = 4
@@ -151,10 +146,7 @@ class EfficientNetLite(Backbone):
 
 
 class InvertedResidual(nn.Module):
-    """Expanding 1×1, depthwise and projecting 1×1 convolution (Sandler et al. 2018).
-
-    The input is added if the shapes match.
-    """
+    """Expanding 1×1, depthwise and projecting 1×1 convolution (Sandler et al. 2018)."""
 
     def __init__(
         self, in_channels: int, out_channels: int, kernel_size: int, stride: int, expansion: int
@@ -178,8 +170,7 @@ class InvertedResidual(nn.Module):
 class DepthwiseConv(nn.Conv2d):
     """A depthwise convolution that trains in float32 on CPUs, also under bf16 autocast.
 
-    In bf16, the backward pass takes up to fifteen times as long on CPUs, except for 3×3 kernels of
-    stride 1.
+    In bf16, its backward pass takes up to fifteen times as long on CPUs.
     """
 
     def forward(self, features: Features) -> Features:

@@ -56,20 +56,11 @@ class Head(nn.Module):
 
     Stage 1 reads the features. Later stages also read the field and the belief maps of the previous
     stage; belief maps are activated, so that inputs do not depend on the loss. C objects have 9·C
-    belief and 16·C field channels.
-
-    Args:
-        in_channels: Channels of the feature maps.
-        num_objects: Number of objects, 1–256.
-        activation: Name of the belief activation.
-        stages: Number of stages, 1–12.
-        make_branch: Builds a branch from input channels, output channels and stage (from 0).
-
-    Attributes:
-        cell_multiple: The feature map's height and width must be multiples of this number.
+    belief and 16·C field channels. ``make_branch`` builds a branch from input channels, output
+    channels and stage (from 0).
     """
 
-    cell_multiple: int = 1
+    cell_multiple: int = 1  # the feature map's height and width are multiples of this number
 
     def __init__(
         self,
@@ -172,9 +163,6 @@ class MultiScale(Head):
     convolution except output convolutions. ``maps`` selects the fusion's input from each scale:
     ``plain`` for maps of 9 or 16 channels (§3.3), ``learned`` for maps with a loss of their own,
     None for features.
-
-    Raises:
-        UserError: ``maps`` is none of these values.
     """
 
     cell_multiple = 4

@@ -58,11 +58,7 @@ def conv_block(
 
 
 class ResidualBlock(nn.Module):
-    """Two 3×3 convolutions with batch norm, added to their input (He et al. 2016, Fig. 2).
-
-    If the shape changes, a 1×1 convolution with batch norm adapts the input. The first convolution
-    has the ``stride``.
-    """
+    """Two 3×3 convolutions with batch norm, added to their input (He et al. 2016, Fig. 2)."""
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__()
@@ -122,11 +118,7 @@ ACTIVATIONS: Final[Mapping[str, Activation]] = {
 
 
 def find_activation(name: object) -> Activation:
-    """Return the activation with this name in :data:`ACTIVATIONS`.
-
-    Raises:
-        UserError: No activation has this name.
-    """
+    """Return the activation with this name in :data:`ACTIVATIONS`."""
     if not isinstance(name, str) or name not in ACTIVATIONS:
         fix = "choose a loss with one of these activations"
         raise UserError(f"activation {name!r:.100}", ", ".join(ACTIVATIONS), fix)

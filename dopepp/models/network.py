@@ -39,10 +39,6 @@ class PoseNetwork(nn.Module):
     """Turns RGB images into belief maps and vector fields.
 
     The network normalises images itself, so that training, inference and exported files agree.
-
-    Attributes:
-        stride: Pixels per map cell.
-        size_multiple: The image's height and width must be multiples of this number.
     """
 
     mean: Tensor
@@ -60,18 +56,15 @@ class PoseNetwork(nn.Module):
         self.backbone, self.attention, self.head = backbone, attention, head
         self.activation, self.num_objects = activation, num_objects
         self.activate = find_activation(activation)
-        self.stride = backbone.stride
+        self.stride = backbone.stride  # pixels per map cell
+        # Height and width of images are multiples of this number.
         self.size_multiple = backbone.stride * math.lcm(backbone.cell_multiple, head.cell_multiple)
         # Not persistent, because a checkpoint must not alter constants of the code.
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     def forward(self, images: Images) -> list[heads.Stage]:
-        """Return the belief logits and vector field of every stage for RGB images, 0–255.
-
-        Raises:
-            UserError: The shape does not match the network.
-        """
+        """Return the belief logits and vector field of every stage for RGB images, 0–255."""
         height, width = images.shape[-2:]
         fits = images.ndim == 4 and images.shape[1] == 3
         if not fits or height % self.size_multiple or width % self.size_multiple:
@@ -128,11 +121,7 @@ def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, 
 
 
 def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
-    """Build the network that a spec describes.
-
-    Raises:
-        UserError: A key is missing or unknown, or a target or argument is not allowed.
-    """
+    """Build the network that a spec describes; a wrong spec raises a UserError."""
     _check_keys(spec)
     activation, num_objects = spec["activation"], spec["num_objects"]
     backbone = BACKBONES.build(spec["backbone"])
@@ -144,11 +133,7 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
 
 
 def check_spec(spec: Mapping[str, Any]) -> None:
-    """Check the keys and targets of a spec without building a network.
-
-    Raises:
-        UserError: A key is missing or unknown, or a target is not allowed.
-    """
+    """Check the keys and targets of a spec without building a network."""
     _check_keys(spec)
     registries: tuple[Registry[Any], ...] = (BACKBONES, ATTENTIONS, HEADS)
     for registry in registries:
@@ -166,10 +151,7 @@ def _check_keys(spec: object) -> None:
 
 
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a deep copy of a spec without the backbone's ``weights_path``.
-
-    Loading a checkpoint must not need a file that exists only on the machine where it was trained.
-    """
+    """Return a deep copy of a spec without ``weights_path``, a file of the training machine."""
     plain: dict[str, Any] = copy.deepcopy(dict(spec))
     if isinstance(plain.get("backbone"), dict):
         plain["backbone"].pop("weights_path", None)

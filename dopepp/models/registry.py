@@ -38,10 +38,8 @@ _GROUPS: Final = {
 class Registry(Generic[T]):
     """Builds objects of one kind from nodes (``_target_``, arguments) whose class is allowed.
 
-    Args:
-        kind: Name of the kind for messages, such as ``"backbone"``.
-        base: Base class of all targets.
-        targets: Dotted names of allowed classes; enabled packages may add others.
+    ``kind`` names the objects in messages. ``targets`` are the dotted names of the allowed classes,
+    subclasses of ``base``; enabled packages may add others.
     """
 
     def __init__(self, kind: str, base: type[T], targets: Iterable[str] = ()) -> None:
@@ -69,20 +67,12 @@ class Registry(Generic[T]):
         return tuple(sorted(self._targets.union(added)))
 
     def register(self, dotted: str) -> None:
-        """Allow a further class by its dotted name.
-
-        Raises:
-            UserError: The name does not resolve to a subclass of this registry's base class.
-        """
+        """Allow a further subclass of ``base`` by its dotted name."""
         self._load(dotted)
         self._targets.add(dotted)
 
     def resolve(self, dotted: object) -> type[T]:
-        """Return the class with an allowed dotted name.
-
-        Raises:
-            UserError: The name is not in the allow-list, or does not resolve to the allowed class.
-        """
+        """Return the class with an allowed dotted name; another name raises a UserError."""
         if not isinstance(dotted, str) or dotted not in self.targets:
             advice = f"register your own {self.kind} in code"
             if self._group and isinstance(dotted, str) and "." in dotted:
@@ -95,11 +85,7 @@ class Registry(Generic[T]):
         return self._load(dotted)
 
     def build(self, node: object, **provided: Any) -> T:
-        """Build the object that a node describes.
-
-        Args:
-            node: ``{"_target_": dotted name, argument: JSON value, …}``.
-            **provided: Further arguments, which the node must not repeat.
+        """Build the object of a node (``_target_``, JSON values) and of the arguments ``provided``.
 
         Raises:
             UserError: The target is not allowed, an argument is unknown, missing, nested,

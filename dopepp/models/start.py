@@ -24,12 +24,9 @@ _FILE: Final = Path(__file__).parents[1] / "pretrained" / "start" / "dopepp_fast
 
 
 def start_from_parts(network: PoseNetwork) -> bool:
-    """Copy the package's weights, learned from random parts, to backbone and head if they fit.
+    """Copy the package's weights of random parts to backbone and head; return whether they fit.
 
     The attention and the object-specific output layers keep their initial weights.
-
-    Returns:
-        Whether the weights fit; otherwise the network remains unchanged.
     """
     weights, _ = read_safetensors(_FILE)
     of_attention = {name for name in network.state_dict() if name.startswith("attention.")}
@@ -37,12 +34,9 @@ def start_from_parts(network: PoseNetwork) -> bool:
 
 
 def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
-    """Copy the weights of a checkpoint to a network.
+    """Copy the weights of a checkpoint to a network of the same architecture.
 
     The output layers keep their initial weights if the numbers of objects differ.
-
-    Raises:
-        UserError: The checkpoint cannot be read, or its network has a different architecture.
     """
     checkpoint = read(path)
     weights = checkpoint.state_dict

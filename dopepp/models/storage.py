@@ -73,8 +73,7 @@ _FIELDS: Final = {"dtype", "shape", "data_offsets"}
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
     """Write a torch file atomically, after moving an existing file to ``previous``, if set.
 
-    Raises:
-        OSError: The file cannot be written; the old file is intact.
+    On an ``OSError`` the old file is intact.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,10 +107,7 @@ def read_mapping(path: Path, kind: str) -> dict[Any, Any]:
     """Load a torch file with a mapping to the CPU, without running code in the file.
 
     Loading takes no more memory than the file has bytes. ``kind`` describes the file in messages.
-
-    Raises:
-        UserError: The file is missing, damaged or too large, or its content is not a mapping of
-            tensors, numbers, text and containers of them.
+    A file that is missing, damaged or too large, or holds other content, raises a UserError.
     """
     path = Path(path)
     _check_file(path, kind)
@@ -140,11 +136,7 @@ def read_mapping(path: Path, kind: str) -> dict[Any, Any]:
 
 
 def check_container(path: Path, kind: str) -> int:
-    """Return the unpacked size of a torch file, bytes, which must not exceed the file's size.
-
-    Raises:
-        UserError: The file is missing, truncated, not a torch file or compressed.
-    """
+    """Return the unpacked size of a torch file, bytes, which must not exceed the file's size."""
     path = Path(path)
     _check_file(path, kind)
     try:
@@ -271,10 +263,7 @@ def _storage_reference(value: object) -> tuple[str, str, int]:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read an untrusted safetensors file.
-
-    Returns:
-        Tensors by name, on the CPU, and the metadata.
+    """Return the tensors (by name, on the CPU) and the metadata of an untrusted safetensors file.
 
     Raises:
         UserError: The file is missing or damaged, or file or header are too large.
@@ -302,11 +291,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def write_safetensors(
     path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Write tensors and metadata atomically.
-
-    Raises:
-        ValueError: The header is longer than :func:`read_safetensors` accepts.
-    """
+    """Write tensors and metadata atomically; a ``ValueError`` for a header too long to be read."""
     plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     content = save(plain, dict(metadata))
     _header(content)

@@ -1,8 +1,7 @@
 """Guards against optimiser steps that are not finite and against empty belief maps.
 
 :class:`FiniteSteps` synchronises with the device once per optimiser step, as often as torch's own
-gradient scaler. :class:`EmptyMaps` lists likely causes when a network detects nothing. To add a
-cause, write a method like :meth:`EmptyMaps._rate` and a line in :meth:`EmptyMaps._warn`.
+gradient scaler. :class:`EmptyMaps` lists likely causes when a network detects nothing.
 """
 
 from __future__ import annotations
@@ -37,11 +36,9 @@ _log = logging.getLogger(__name__)
 FOLDER: Final = "nonfinite"  # Folder of the run with the batch that ended the run
 
 _COUNTS: Final = Range(1, 10**6)
-_MAX_TILES: Final = 64
 _CHECKED: Final = ("loss", "gradient", "batch norm's statistics")  # After every backward pass
 _MIN_INSIDE: Final = 0.5  # Share of keypoints inside images below which labels are probably wrong
 _MIN_CELLS: Final = 3.0  # Narrower objects have all keypoints in one peak of the maps
-_FALL: Final = 0.95  # A validation loss above this share of its first value has not decreased
 
 
 @dataclass
@@ -58,9 +55,8 @@ class FiniteSteps(Callback):
 
     A skipped step changes neither weights nor optimiser states nor batch norm's statistics, but
     counts for the schedule. With gradient accumulation, the whole step is skipped. Overflows due to
-    the scaling of mixed precision do not count. ``train/skipped_steps`` counts over the whole run.
-    After ``max_in_a_row`` skipped steps in a row, the run ends with the last batch in the folder
-    ``nonfinite/`` of the run.
+    the scaling of mixed precision do not count. After ``max_in_a_row`` skipped steps in a row, the
+    run ends with the last batch in its folder ``nonfinite/``.
     """
 
     def __init__(self, max_in_a_row: int = 10) -> None:
@@ -112,11 +108,7 @@ class FiniteSteps(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Skip the step if loss, gradient or batch norm statistics are not finite on any process.
-
-        Raises:
-            RunError: ``max_in_a_row`` steps in a row were skipped, or the weights are not finite.
-        """
+        """Skip a step that is not finite on any process; end the run after too many in a row."""
         passes, self._passes = self._passes, []
         bad = torch.stack([item.bad for item in passes]).sum(dim=0)
         if trainer.world_size > 1:
@@ -155,20 +147,17 @@ class FiniteSteps(Callback):
         Gradients are summed over processes: only the loss shows which process has the batch.
         """
         folder = Path(trainer.default_root_dir) / FOLDER
-        for item in passes:
-            if item.bad[0] if "loss" in names else item.bad.any():
-                step, epoch = trainer.global_step, trainer.current_epoch
-                facts = {"step": step, "epoch": epoch, "not_finite": names}
-                facts["loss"] = float(item.loss)
-                path = folder / f"step_{step}_rank_{trainer.global_rank}"
-                _dump_batch(path, item.batch, facts)
-                break
+        mine = (item for item in passes if (item.bad[0] if "loss" in names else item.bad.any()))
+        if (item := next(mine, None)) is not None:
+            step, epoch = trainer.global_step, trainer.current_epoch
+            facts = {"step": step, "epoch": epoch, "not_finite": names, "loss": float(item.loss)}
+            _dump_batch(folder / f"step_{step}_rank_{trainer.global_rank}", item.batch, facts)
         return folder
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
     """Write ``PATH.pt`` (batch, ``facts``) and ``PATH.png`` (first images); warn on a failure."""
-    shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
+    shown = batch.rows(torch.arange(min(len(batch), 64))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [
         Tile(overlay(image, [Wireframe(points, GREEN, "true") for points in keypoints]), key)
@@ -248,7 +237,7 @@ class EmptyMaps(Callback):
             self._warn(trainer, pl_module)
 
     def _warn(self, trainer: Trainer, system: PoseSystem) -> None:
-        """Log once that all maps are empty, with the likely causes."""
+        """Log once that all maps are empty, with the likely causes first."""
         if self._warned or not trainer.is_global_zero:
             return
         self._warned = True
@@ -260,39 +249,34 @@ class EmptyMaps(Callback):
             f"(recovery.peak_threshold={options.peak_threshold:g}), of a centroid {centroid:.2g} "
             f"(recovery.centroid_threshold={options.centroid_threshold:g}). The usual causes:"
         ]
-        rate, labels = self._rate(trainer), self._labels()
-        early = not rate[0] and not labels[0], self._early(trainer, system)
-        causes = {
-            "too few training steps": early,
-            "a learning rate that is too high or too low": rate,
-            "labels or units that contradict the images": labels,
-        }
-        likely_first = sorted(causes.items(), key=lambda item: not item[1][0])
-        for number, (name, (is_likely, text)) in enumerate(likely_first, start=1):
-            lines.append(f"  {number}. {name}{' (likely here)' if is_likely else ''}: {text}")
-        _log.warning("\n".join(lines))
-
-    def _early(self, trainer: Trainer, system: PoseSystem) -> str:
-        """Return advice for a training run with too few steps."""
-        text = f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
-        text += "train longer (trainer.max_epochs)"
+        bad_rate, about_rate = self._rate(trainer)
+        bad_labels, about_labels = self._labels()
+        steps = (
+            f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
+            "train longer (trainer.max_epochs)"
+        )
         if isinstance(system.loss, MapMSE):
-            text += (
+            steps += (
                 "; with model/loss=mse, empty maps have a small squared error because peaks cover "
                 "few cells; model/loss=spatial_ce has no such plateau"
             )
-        return text
+        causes = [
+            (not bad_rate and not bad_labels, f"too few training steps{{}}: {steps}"),
+            (bad_rate, f"a learning rate that is too high or too low{{}}: {about_rate}"),
+            (bad_labels, f"labels or units that contradict the images{{}}: {about_labels}"),
+        ]
+        likely_first = sorted(causes, key=lambda cause: not cause[0])
+        for number, (is_likely, text) in enumerate(likely_first, start=1):
+            lines.append(f"  {number}. {text.format(' (likely here)' if is_likely else '')}")
+        _log.warning("\n".join(lines))
 
     def _rate(self, trainer: Trainer) -> tuple[bool, str]:
         """Return whether the validation loss has not decreased by 5 %, and advice on the rate."""
         first, last = self._first_loss, self._loss
-        flat = self._num_empty > 1 and not last < _FALL * first
-        rates = [
-            group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups
-        ]
-        present = f"{max(rates):.2g}" if rates else "unknown"
+        flat = self._num_empty > 1 and not last < 0.95 * first
+        rate = max(group["lr"] for group in trainer.optimizers[0].param_groups)
         return flat, (
-            f"the validation loss went from {first:.4g} to {last:.4g}, the rate is {present} now; "
+            f"the validation loss went from {first:.4g} to {last:.4g}, the rate is {rate:.2g} now; "
             "find a rate with job=lr_finder, set it with optimizer.lr=…"
         )
 

@@ -122,11 +122,7 @@ class LastCheckpoint(Checkpoint):
         self._random = None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the last checkpoint, and write the checkpoints that could not be written before.
-
-        Raises:
-            SavingFailedError: The checkpoint cannot be written.
-        """
+        """Save the last checkpoint, and write those that could not be written before."""
         self._stop.end()
         self._save(trainer, _between_epochs)
         if trainer.is_global_zero:
@@ -171,11 +167,9 @@ class LastCheckpoint(Checkpoint):
 class StopRequest:
     """Catches signals that stop a run, so that the run can save first.
 
-    A second Ctrl-C ends the run at once. SIGTERM may be repeated, as schedulers do. Under SLURM,
-    SIGUSR1 (``--signal=USR1@90``) acts like SIGTERM.
-
-    Attributes:
-        number: The caught signal, SIGTERM for SIGUSR1; None before any signal.
+    ``number`` is the caught signal, SIGTERM for SIGUSR1. A second Ctrl-C ends the run at once.
+    SIGTERM may be repeated, as schedulers do. Under SLURM, SIGUSR1 (``--signal=USR1@90``) acts like
+    SIGTERM.
     """
 
     def __init__(self) -> None:
@@ -232,17 +226,14 @@ def _progress(trainer: Trainer) -> tuple[int, float | None]:
 
 def _best(trainer: Trainer) -> ModelCheckpoint | None:
     """Return the callback that keeps the best checkpoint, or None."""
-    for callback in trainer.checkpoint_callbacks:
-        if isinstance(callback, ModelCheckpoint) and callback.monitor is not None:
-            return callback
-    return None
+    kept = (item for item in trainer.checkpoint_callbacks if isinstance(item, ModelCheckpoint))
+    return next((item for item in kept if item.monitor is not None), None)
 
 
 def _forget_later_best(trainer: Trainer) -> None:
     """Reset the best checkpoint if its file is newer than the resumed step.
 
-    Without deterministic arithmetic, the resumed run would not reproduce this checkpoint, and the
-    metrics would belong to another checkpoint.
+    Without deterministic arithmetic, the resumed run would not reproduce this checkpoint.
     """
     best = _best(trainer)
     if best is None or not best.best_model_path:

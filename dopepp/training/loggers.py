@@ -27,7 +27,7 @@ class MetricsTable(Logger):
     """Writes logged values to a CSV file with a row per step and a column per metric.
 
     Unlike Lightning's ``CSVLogger``, this logger continues an existing file and replaces it
-    atomically. Rows stay in memory while the file cannot be written. Only rank 0 writes.
+    atomically. Rows stay in memory while the file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,11 +73,7 @@ class MetricsTable(Logger):
 
     @rank_zero_only
     def write(self) -> None:
-        """Write all rows to the CSV file, unless there are none.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Write all rows to the CSV file, unless there are none; an ``OSError`` if that fails."""
         if not self._rows:
             return
         columns = sorted({name for row in self._rows.values() for name in row})

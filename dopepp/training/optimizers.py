@@ -80,8 +80,7 @@ class Muon(AdamW):
 def orthogonalise(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
     """Return approximately U·Vᵀ of a matrix U·S·Vᵀ, with singular values of 0.7–1.2.
 
-    All rounds are polynomials of the small Gram matrix; only the first and the last product use the
-    matrix itself.
+    All rounds but the last product are polynomials of the small Gram matrix.
     """
     if matrix.shape[0] > matrix.shape[1]:
         return orthogonalise(matrix.T).T

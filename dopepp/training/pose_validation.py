@@ -1,10 +1,7 @@
 """Pose metrics, early stopping and contact sheets of validations.
 
 Poses are recovered from the maps, and ``PoseMetrics`` accumulates their errors as in evaluations.
-To log another metric, add a field of :class:`~dopepp.metrics.row.PoseRow` and its name in
-:data:`LOGGED`. To draw another sheet of the first validation images, add a subclass of
-:class:`ValidationSheet` with a ``name`` and :meth:`~ValidationSheet.tiles`, a line in
-``dopepp/experiment/assembly/build_system.py`` and an entry in ``conf/callbacks``.
+To log another metric, add its field of :class:`~dopepp.metrics.row.PoseRow` to :data:`LOGGED`.
 """
 
 from __future__ import annotations
@@ -40,15 +37,13 @@ LOGGED: Final = (
     "add_01d", "add_s_01d", "add_or_s_01d", "pass_5cm", "pass_10cm", "auc_10cm", "auc_s_10cm",
     "ar_mssd", "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
 )  # fmt: skip
-_OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")  # Undefined without matches
 
 
 class PoseMetricsCallback(Callback):
     """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
 
-    ``val/selection``, which chooses the best checkpoint, is the mean over objects of the area under
-    the accuracy curve (exact AUC) of ADD up to 0.1 m, or of ADD-S for symmetric objects
-    ("ADD(-S)"). Later callbacks in the list can read :attr:`metrics`.
+    ``val/selection``, which chooses the best checkpoint, is the mean over objects of the exact AUC
+    of ADD up to 0.1 m, or of ADD-S for symmetric objects. Later callbacks can read :attr:`metrics`.
     """
 
     metrics: PoseMetrics
@@ -79,12 +74,11 @@ class PoseMetricsCallback(Callback):
         values["selection"] = mean.auc_or_s_10cm
         on_bar = "add_or_s_01d" if mean.num_symmetries > 1 else "add_01d"
         for name, value in values.items():
+            if value is None and name.startswith("median_rotation"):
+                continue  # undefined without matches
             # ModelCheckpoint needs a value even if the validation images have no objects.
-            if value is None and name not in _OF_MATCHES:
-                value = math.nan
-            if value is not None:
-                shown = name == on_bar
-                pl_module.log(f"val/{name}", float(value), prog_bar=shown, rank_zero_only=False)
+            number = math.nan if value is None else float(value)
+            pl_module.log(f"val/{name}", number, prog_bar=name == on_bar, rank_zero_only=False)
 
 
 def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:
@@ -101,10 +95,7 @@ def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Inst
 
 
 class EarlyStop(EarlyStopping):
-    """Lightning's early stopping for resumed runs.
-
-    The patience comes from the current config. A stopped run continues only with a larger patience.
-    """
+    """Lightning's early stopping, whose patience in a resumed run comes from the current config."""
 
     @property
     def impatient(self) -> bool:

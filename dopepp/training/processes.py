@@ -83,11 +83,7 @@ class WatchedLauncher(_SubprocessScriptLauncher):
     def launch(
         self, function: Callable[..., Any], *args: Any, trainer: Trainer | None = None, **kw: Any
     ) -> Any:
-        """Start the processes of the further ranks, then call the function.
-
-        Raises:
-            ProcessDiedError: The function failed because another process has died.
-        """
+        """Start the further ranks and call the function; name a process that died meanwhile."""
         self.cluster_environment.validate_settings(self.num_processes, self.num_nodes)
         started_by = os.environ.pop(_STARTED_BY, None)
         if not self.cluster_environment.creates_processes_externally:
@@ -113,10 +109,7 @@ class WatchedLauncher(_SubprocessScriptLauncher):
 
 
 class WatchedDDP(DDPStrategy):
-    """Distributed data parallel with :class:`WatchedLauncher`.
-
-    The death of a process on another machine is noticed after ``timeout_s`` in a collective.
-    """
+    """Distributed data parallel with :class:`WatchedLauncher` and a timeout of collectives."""
 
     def __init__(self, timeout_s: float) -> None:
         super().__init__(timeout=timedelta(seconds=timeout_s))

@@ -31,19 +31,9 @@ class TrialReport(Callback):
     """Reports the objective of a trial to its study after each validation and stops poor trials.
 
     Optuna's median rule stops a trial whose best value is worse than the median of the other
-    trials' values at the same epoch.
-
-    Args:
-        storage: SQLite file or database URL.
-        study: Name of the study.
-        number: Number of the trial within the study.
-        monitor: Logged value that is the objective.
-        prune: Whether poor trials are stopped.
-        after_trials: Number of finished trials before any trial is stopped.
-        after_epochs: Number of epochs before a trial is stopped.
-
-    Attributes:
-        pruned: Reason for stopping the training; empty otherwise.
+    trials' values at the same epoch. ``storage`` is an SQLite file or a database URL, ``monitor``
+    the logged objective. No trial is stopped before ``after_trials`` have finished, or before its
+    own epoch ``after_epochs``. ``pruned`` is the reason for stopping, or empty.
     """
 
     _study: Study
@@ -94,22 +84,14 @@ class TrialReport(Callback):
 
 
 def raise_if_pruned(trainer: Trainer) -> None:
-    """Raise an exception if a :class:`TrialReport` has stopped the training.
-
-    Raises:
-        PrunedError: The trial was pruned.
-    """
+    """Raise a :class:`PrunedError` if a :class:`TrialReport` has stopped the training."""
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         if isinstance(callback, TrialReport) and callback.pruned:
             raise PrunedError(callback.pruned)
 
 
 def open_storage(location: str) -> BaseStorage:
-    """Open or create the database of a study: an SQLite file or a database URL.
-
-    Raises:
-        UserError: The database cannot be opened.
-    """
+    """Open or create the database of a study: an SQLite file or a database URL."""
     from optuna.exceptions import StorageInternalError
     from optuna.storages import RDBStorage
     from sqlalchemy.exc import SQLAlchemyError

@@ -39,10 +39,8 @@ class RefinedProgress(Callback):
     Args:
         images: Held-out images, at the camera's resolution.
         refine: Method or methods that refine the poses, e.g. ``region``.
-        stop_at: ``val/refined`` at which the training ends, if confirmed on ``NUM_CONFIRMING``
-            images; None: never.
-        every_s: Shortest time between two measurements, seconds. The time is longer if measurements
-            would take more than a tenth of the training.
+        stop_at: ``val/refined`` at which the training ends, if confirmed; None: never.
+        every_s: Shortest time between two measurements, which take at most a tenth of the time.
     """
 
     def __init__(

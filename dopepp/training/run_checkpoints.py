@@ -52,12 +52,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Saves Lightning's checkpoints atomically and loads them without running code.
 
     A checkpoint that cannot be written (disk full, server unavailable) is kept in memory until the
-    next save, which writes it first, so that no file refers to a missing file. A newer version of
-    the same file replaces the kept version.
-
-    Args:
-        prepare: Called before each file is written; its ``OSError`` prevents the writing.
-        folder: Folder of the run; no files outside are removed.
+    next save, which writes it first, so that no file refers to a missing file. ``prepare`` is
+    called before each file is written. No file outside ``folder``, the run's, is removed.
     """
 
     def __init__(
@@ -75,9 +71,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
-        """Write the file atomically; if that fails, keep the checkpoint in memory and warn.
+        """Write the file, after moving the old file to ``storage_options["previous"]``, if set.
 
-        The options ``{"previous": PATH}`` move the old file to this path.
+        If that fails, keep the checkpoint in memory and warn.
         """
         target = Path(os.fspath(path))
         self._waiting.pop(target, None)
@@ -87,11 +83,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             _log.warning("%s; retrying at the next save", _failure(self.waiting[0], error))
 
     def finish(self) -> None:
-        """Write the checkpoints that could not be written yet.
-
-        Raises:
-            SavingFailedError: A file cannot be written.
-        """
+        """Write the waiting checkpoints, or raise a SavingFailedError."""
         error = self._write_waiting()
         if error is not None:
             raise SavingFailedError(_failure(self.waiting[0], error)) from error
@@ -125,10 +117,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Load a checkpoint without running pickled code.
-
-        The run folder may have been moved, so the file paths in the callbacks' states are updated.
-        """
+        """Load a checkpoint without running code, and update its paths if the run was moved."""
         loaded: Mapping[str, Any] = super().load_checkpoint(path, map_location, weights_only=True)
         if self._folder is None:
             return dict(loaded)
@@ -140,10 +129,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
     """Return the newest complete checkpoint of a run; None if the run has not saved any.
 
-    Damaged files are logged.
-
-    Raises:
-        UserError: All checkpoints are damaged.
+    Damaged files are logged; a UserError if all are damaged.
     """
     damaged = []
     paths = [run_dir / FOLDER / name for name in (LAST, PREVIOUS, BEST)]
@@ -175,11 +161,7 @@ def saved_step(path: Path) -> int | None:
 
 
 def check_free_space(run_dir: Path, weight_bytes: int) -> None:
-    """Check in advance that a run can write its checkpoints, each with ``weight_bytes`` of weights.
-
-    Raises:
-        UserError: The folder is not writable, or has too little free space.
-    """
+    """Check that a run can write its checkpoints, each with ``weight_bytes`` of weights."""
     folder = run_dir / FOLDER
     probe = folder / ".probe"
     try:

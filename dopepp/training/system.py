@@ -107,11 +107,7 @@ class PoseSystem(LightningModule):
         return stages
 
     def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
-        """Return the target maps of a batch, on its device.
-
-        The outputs ``stages`` of the network may choose among the equivalent poses of a symmetric
-        part (:mod:`~dopepp.training.targets`).
-        """
+        """Return the target maps of a batch; ``stages`` may choose among equivalent poses."""
         keypoints = batch.keypoints
         if self.symmetry.active:
             keypoints = choose_keypoints(batch, stages, self.symmetry, self.loss, self.geometry)
@@ -153,10 +149,7 @@ class PoseSystem(LightningModule):
         return configured
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep only the trained weights and the progress of schedules of a checkpoint to resume.
-
-        The schedules' other values come from the config, because a resumed run may be longer.
-        """
+        """Keep the trained weights and the progress of schedules; settings may have changed."""
         restore_trained_weights(checkpoint)
         states = checkpoint["lr_schedulers"]
         self._resumed_schedules = [_without_progress(state) for state in states]
@@ -184,10 +177,7 @@ class PoseSystem(LightningModule):
                     group["lr"] = rate
 
     def _apply_settings(self) -> None:
-        """Replace the optimiser settings of the checkpoint by the settings of the current config.
-
-        Settings that a schedule sets in every step are kept.
-        """
+        """Replace the optimiser settings of the checkpoint, except those that a schedule sets."""
         scheduled = {"lr"} if self.trainer.lr_scheduler_configs else set()
         for optimizer in self.trainer.optimizers:
             for group, settings in zip(optimizer.param_groups, self._settings, strict=True):
@@ -196,11 +186,7 @@ class PoseSystem(LightningModule):
                 group.update({k: v for k, v in settings.items() if k not in unchanged})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add :attr:`payload`, so that the file can be loaded without this module or a config.
-
-        Raises:
-            RunError: Weights or optimiser states are not finite.
-        """
+        """Check the state and add :attr:`payload`, with which the file describes itself."""
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
 
@@ -217,11 +203,7 @@ def all_finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def check_state(checkpoint: Mapping[str, Any]) -> None:
-    """Check that weights and optimiser states of a checkpoint are finite.
-
-    Raises:
-        RunError: A value is not finite.
-    """
+    """Raise a RunError if weights or optimiser states of a checkpoint are not finite."""
     for name, text in (("state_dict", "weights"), ("optimizer_states", "optimiser's state")):
         if not all_finite(_tensors(checkpoint.get(name))):
             when = f"after step {checkpoint.get('global_step')}"

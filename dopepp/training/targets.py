@@ -44,9 +44,6 @@ class SymmetryOptions(Checked):
         canonical: Whether targets use the equivalent pose nearest to the reference orientation.
         border_deg: Margin, degrees. An equivalent pose with a lower loss may be used if its angle
             to the reference is within this margin of the smallest angle.
-
-    Raises:
-        UserError: ``border_deg`` is above 0 without ``canonical``.
     """
 
     canonical: bool = True
@@ -105,13 +102,10 @@ def choose_keypoints(
 
 
 class Equivalents(NamedTuple):
-    """Keypoints of equivalent poses, input px, by increasing angle to the reference orientation.
+    """Equivalent poses by increasing angle to the reference orientation."""
 
-    ``allowed`` marks poses that may be used as targets; the first is always allowed.
-    """
-
-    keypoints: Float[Tensor, "batch instances choices 9 2"]
-    allowed: Bool[Tensor, "batch instances choices"]
+    keypoints: Float[Tensor, "batch instances choices 9 2"]  # input pixels
+    allowed: Bool[Tensor, "batch instances choices"]  # may be used as targets; the first always
 
 
 class SymmetryHandling:
@@ -132,10 +126,7 @@ class SymmetryHandling:
         }
 
     def equivalents(self, batch: Batch) -> Equivalents:
-        """Return the keypoints of the poses that are equivalent to the labels of a batch.
-
-        Instances of parts without symmetries keep exactly their labelled keypoints.
-        """
+        """Return the keypoints of all poses that are equivalent to the labels of a batch."""
         poses, angles = self._poses(batch)  # angles to the reference orientation
         order = angles.argsort(dim=-1, stable=True)
         nearest = angles.gather(-1, order)
@@ -186,14 +177,12 @@ class SymmetryHandling:
 
 
 def _symmetry_row(part: Part) -> dict[str, np.ndarray]:
-    """Return a part's row of the tables of symmetries.
+    """Return a part's row of the tables of symmetries, lengths in metres.
 
-    Returns:
-        Arrays by name: ``transforms`` (n, 4, 4), the discrete symmetries with the identity;
-        ``axes`` (3,), the unit axis of a round part, or zeros; ``offsets`` (3,), a point on this
-        axis, metres; ``references`` (3, 3), the reference orientation; ``fixed`` (3,), the point
-        that all symmetries keep, metres; ``cuboids`` (9, 3), the keypoints, metres; ``symmetric``,
-        whether the part has symmetries.
+    Arrays by name: ``transforms`` (n, 4, 4), the discrete symmetries with the identity; ``axes``
+    (3,), the unit axis of a round part, or zeros; ``offsets`` (3,), a point on this axis;
+    ``references`` (3, 3), the reference orientation; ``fixed`` (3,), the point that all symmetries
+    keep; ``cuboids`` (9, 3), the keypoints; ``symmetric``, whether the part has symmetries.
     """
     discrete = part.symmetries_discrete
     transforms = np.eye(4)[None]

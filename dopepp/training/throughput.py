@@ -1,14 +1,9 @@
-"""Throughput, remaining time and profiles of a training run.
-
-To add a profiler, write a subclass of Lightning's ``Profiler`` and add a line to
-:func:`make_profiler` and to :func:`profile_rows`.
-"""
+"""Throughput, remaining time and profiles of a training run."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,26 +11,16 @@ from typing import Any, Final, Literal
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.profilers import Profiler, PyTorchProfiler, SimpleProfiler
-from torch.profiler import profile
 
 from dopepp.data.batch import Batch
 
 _log = logging.getLogger(__name__)
 
-FOLDER: Final = "profile"  # Folder of the run with the report and traces
-
-_STARVED: Final = 0.2  # Share of waiting above which a hint is logged
-_FILE: Final = "report"
-
-Total = tuple[str, int, float]
-"""Name of a hook or operator, number of calls, and total seconds."""
+FOLDER: Final = "profile"  # folder of the run with the report and the trace
 
 
 class Throughput(Callback):
-    """Logs images per second of training, and the share of time spent waiting for the loader.
-
-    The values are ``throughput/images_per_s`` and ``throughput/loader_wait``.
-    """
+    """Logs ``throughput/images_per_s`` and the share of time ``throughput/loader_wait``."""
 
     def __init__(self) -> None:
         self._images, self._waited = 0, 0.0
@@ -69,7 +54,7 @@ class Throughput(Callback):
             hint = "; data.cache=memory or disk renders each image once"
             text = "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s"
             values = (trainer.current_epoch, speed, 100 * waiting)
-            _log.info(text, *values, hint if waiting > _STARVED else "")
+            _log.info(text, *values, hint if waiting > 0.2 else "")
 
 
 class RunProgress(TQDMProgressBar):
@@ -97,62 +82,31 @@ class RunProgress(TQDMProgressBar):
         return {"left": str(timedelta(seconds=round(seconds))), **metrics}
 
 
-class Operators(PyTorchProfiler):
-    """Profiles torch operators over all recorded steps (Lightning reports the last step only)."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(dirpath=folder, filename=_FILE, on_trace_ready=self._collect)
-        self._folder, self._num_traces = folder, 0
-        self._totals: dict[str, tuple[int, float]] = {}
-
-    def _collect(self, recorded: profile) -> None:
-        """Export a recording as a Chrome trace, and add its times and calls to the totals."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        recorded.export_chrome_trace(str(self._folder / f"trace_{self._num_traces}.json"))
-        self._num_traces += 1
-        operators: Any = recorded.key_averages()
-        for operator in operators:
-            if operator.is_user_annotation or operator.key.startswith("[pl]"):
-                continue  # Lightning's hooks
-            calls, seconds = self._totals.get(operator.key, (0, 0.0))
-            # For GPU operators, the time of launch and execution.
-            seconds += 1e-6 * (operator.self_cpu_time_total + operator.self_device_time_total)
-            self._totals[operator.key] = (calls + operator.count, seconds)
-
-    def totals(self) -> list[Total]:
-        """Return each operator's total time and number of calls, slowest first."""
-        return _slowest_first((name, *total) for name, total in self._totals.items())
-
-    def summary(self) -> str:
-        """Return a report with a line per operator, slowest first: seconds, calls and name."""
-        self._delete_profilers()
-        return "".join(
-            f"{seconds:12.6f} s {calls:8d} calls  {name}\n"
-            for name, calls, seconds in self.totals()
-        )
-
-
 def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
     """Build a profiler of the loop's hooks (``simple``) or of torch operators (``pytorch``)."""
-    if kind == "simple":
-        return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
-    return None if kind is None else Operators(run_dir / FOLDER)
+    if kind is None:
+        return None
+    profiler = SimpleProfiler if kind == "simple" else PyTorchProfiler
+    return profiler(dirpath=run_dir / FOLDER, filename="report")
 
 
 def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
     """Return the slowest hooks or operators, with calls, total seconds and ms per call as text."""
-    totals: list[Total] = []
-    if isinstance(profiler, Operators):
-        totals = profiler.totals()
-    elif isinstance(profiler, SimpleProfiler):  # includes the time of nested hooks
-        recorded = profiler.recorded_durations.items()
-        totals = _slowest_first((name, len(seconds), sum(seconds)) for name, seconds in recorded)
+    totals: list[tuple[str, int, float]] = []
+    if isinstance(profiler, SimpleProfiler):  # includes the time of nested hooks
+        for name, durations in profiler.recorded_durations.items():
+            totals.append((name, len(durations), sum(durations)))
+    elif isinstance(profiler, PyTorchProfiler) and profiler.function_events:
+        for event in profiler.function_events.key_averages():
+            seconds = 1e-6 * (event.self_cpu_time_total + event.self_device_time_total)
+            totals.append((event.key, event.count, seconds))
+    slowest = sorted(totals, key=lambda total: total[2], reverse=True)[:limit]
     return [
-        {"what": name, "calls": f"{calls:,}", "s": f"{seconds:.3f}", "ms/call": f"{ms:.2f}"}
-        for name, calls, seconds in totals[:limit]
-        for ms in (1000 * seconds / max(1, calls),)
+        {
+            "what": name,
+            "calls": f"{calls:,}",
+            "s": f"{seconds:.3f}",
+            "ms/call": f"{1000 * seconds / max(1, calls):.2f}",
+        }
+        for name, calls, seconds in slowest
     ]
-
-
-def _slowest_first(totals: Iterable[Total]) -> list[Total]:
-    return sorted(totals, key=lambda total: total[2], reverse=True)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
 

@@ -73,16 +73,7 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
 
 
 @pytest.mark.slow
-def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypatch, caplog):
-    def warnings(*overrides: str) -> list[str]:
-        caplog.clear()
-        call("evaluate.py", *measured, *overrides, code=0)
-        said = [record.getMessage() for record in caplog.records]
-        return [line for line in said if line.startswith("the test images have changed since")]
-
-    measured = (f"ckpt_path={run / 'checkpoints' / 'best.ckpt'}", f"output_dir={tmp_path / 'e'}")
-    assert warnings() == []
-
+def test_a_run_with_changed_images_is_not_resumed(run, call, monkeypatch):
     render = Factory.render
 
     def darker(self: Factory, *place: Any) -> Any:
@@ -91,10 +82,5 @@ def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypa
         return rendered
 
     monkeypatch.setattr(Factory, "render", darker)
-    (line,) = warnings()
-    assert line.endswith("pixels of the first image")
-    # Another test set is what its user asks for.
-    assert warnings("virtual.preset=table") == []
-    # … and in training these are other data.
     refused = call("train.py", f"resume={run}", "trainer.max_epochs=2")
     assert "train images: as trained on → changed (pixels of the first image)" in refused.line

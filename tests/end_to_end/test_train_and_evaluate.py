@@ -63,7 +63,7 @@ def test_a_run_shows_what_it_does(trained):
     for text in (
         "config", "model", "width: 0.0625",  # the config's tree
         "train", "virtual",  # the sources
-        "no accelerator: about", "precision",
+        "precision",
         "pivconnector: 3 test images", "ADD-0.1d", "AUC[0,10cm]", "rotation °", "missed %",
         "chance, all rotations", "best constant pose",
         "checkpoints/best.ckpt", "metrics.json",

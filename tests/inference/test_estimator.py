@@ -21,8 +21,9 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.rotation import random_rotation, rotation_angle
 from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps import MapGeometry, encode
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import make_part
 from dopepp.virtual import Scene, SceneObject, make_surface, render

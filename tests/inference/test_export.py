@@ -18,7 +18,8 @@ from dopepp.inference.export import EXPORTERS, check_possible
 from dopepp.inference.runtimes import Export
 from dopepp.models import network as specs
 from dopepp.models.backbones import Backbone
-from dopepp.models.checkpoint import Checkpoint, load_network, write_atomic
+from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts.catalogue import pivconnector
 
 K = camera_matrix(130, 130, 63.5, 47.5)

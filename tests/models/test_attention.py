@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.signal import correlate2d
 
-from dopepp.models.attention import CBAM, SE, Identity
+from dopepp.models.attention import CBAM, SE
 
 
 def sigmoid(values):
@@ -45,11 +45,3 @@ def test_se_weighs_channels_by_their_mean():
     hidden = np.maximum(features.numpy().mean((2, 3)) @ weights["mlp.0.weight"].T, 0)
     expected = features.numpy() * sigmoid(hidden @ weights["mlp.2.weight"].T)[:, :, None, None]
     np.testing.assert_allclose(module(features).detach().numpy(), expected, rtol=1e-10)
-
-
-@pytest.mark.parametrize("module", [Identity, SE, CBAM])
-@pytest.mark.parametrize("channels", [8, 24, 128])
-def test_shape_is_kept(module, channels):
-    features = torch.randn(2, channels, 4, 7)
-    assert module(channels)(features).shape == features.shape
-    assert (module(channels)(features) is features) == (module is Identity)

@@ -31,14 +31,19 @@ def test_dsc_is_depthwise_then_pointwise_with_relu_after_each():
         assert (pointwise.kernel_size, pointwise.groups) == ((1, 1), 1)
 
 
-@pytest.mark.parametrize("backbone", [DSC, VGG19, VGG19Original])
 @pytest.mark.parametrize(("width", "channels"), [(0.125, 16), (0.3, 40), (0.5, 64)])
 @pytest.mark.parametrize("batch_norm", [False, True])
+@pytest.mark.parametrize("backbone", [DSC, VGG19, VGG19Original])
 def test_publishes_its_channels_and_stride(backbone, width, channels, batch_norm):
-    backbone = backbone(width, batch_norm).eval()
-    assert (backbone.out_channels, backbone.stride) == (channels, 8)
+    check_shape(backbone(width, batch_norm), channels, 1, (64, 48))
+
+
+def check_shape(backbone, channels, cell_multiple, size):
+    published = (backbone.out_channels, backbone.stride, backbone.cell_multiple)
+    assert published == (channels, 8, cell_multiple)
     with torch.no_grad():
-        assert backbone(torch.zeros(1, 3, 64, 48)).shape == (1, channels, 8, 6)
+        features = backbone.eval()(torch.zeros(1, 3, *size))
+    assert features.shape == (1, channels, size[0] // 8, size[1] // 8)
 
 
 def test_a_pyramid_has_the_weights_of_its_blocks():
@@ -54,15 +59,12 @@ def test_a_pyramid_has_the_weights_of_its_blocks():
     assert all(layer.bias is None for layer in convolutions(backbone))
 
 
+@pytest.mark.parametrize(
+    ("width", "channels", "size"), [(0.125, 24, (64, 64)), (0.25, 48, (32, 160))]
+)
 @pytest.mark.parametrize("backbone", [Pyramid, EfficientNetLite])
-@pytest.mark.parametrize("size", [(64, 64), (32, 160)])
-@pytest.mark.parametrize(("width", "channels"), [(0.125, 24), (0.25, 48)])
 def test_a_pyramid_publishes_its_channels_and_stride(backbone, size, width, channels):
-    backbone = backbone(width=width).eval()
-    assert (backbone.out_channels, backbone.stride, backbone.cell_multiple) == (channels, 8, 4)
-    with torch.no_grad():
-        features = backbone(torch.zeros(1, 3, *size))
-    assert features.shape == (1, channels, size[0] // 8, size[1] // 8)
+    check_shape(backbone(width=width), channels, 4, size)
 
 
 @pytest.mark.parametrize("kind", [Pyramid, EfficientNetLite])

@@ -144,11 +144,3 @@ def test_losses_of_the_images_have_the_loss_as_their_mean(loss):
     images = loss.per_image(stages, belief, field)
     assert (images.shape, images.requires_grad) == ((4,), False)
     assert images.mean().item() == pytest.approx(loss(stages, belief, field)[0].item(), rel=1e-5)
-
-
-def test_the_loss_of_an_image_depends_on_this_image_only():
-    belief, field = torch.rand(3, 9, 8, 8), torch.ones(3, 16, 8, 8)
-    wrong = belief.clone()
-    wrong[1] += 0.5
-    losses = MapMSE().per_image([(wrong, field)], belief, field)
-    assert losses.tolist() == pytest.approx([0, 0.25, 0])

@@ -6,7 +6,7 @@ from torch import nn
 
 from dopepp.core.errors import UserError
 from dopepp.models.heads import Cascade, MultiScale, SharedTrunk
-from dopepp.models.layers import find_activation, scaled_channels
+from dopepp.models.layers import find_activation
 from dopepp.models.network import build_network, network_cost
 from tests.models.conftest import assert_weights, weights_of
 
@@ -83,17 +83,16 @@ def test_every_scale_of_a_multi_scale_stage_has_its_own_maps(make_spec, stages):
     assert all(parameter.grad is None for parameter in branch.up_quarter.parameters())
 
 
-def test_maps_of_nine_channels_cost_less_than_features(make_spec):
-    for maps, count in ((None, 6_573_419), ("plain", 5_152_694), ("learned", 5_152_694)):
-        network = build_network(make_spec(head_batch_norm=True, head_maps=maps))
-        assert num_parameters(network) == count
-
-
-def test_the_fast_network_has_the_weights_that_are_documented(make_spec):
-    """conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width."""
-    widths = {"backbone_width": 0.5, "head_width": 0.5}
-    network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **widths))
-    assert num_parameters(network) == 2_645_305
+@pytest.mark.parametrize(("options", "count"), [
+    *(({"head_batch_norm": True, "head_maps": maps}, count) for maps, count in (
+        (None, 6_573_419), ("plain", 5_152_694), ("learned", 5_152_694),
+    )),
+    # conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width.
+    ({"backbone": "Pyramid", "attention": "Identity", "head": "SharedTrunk",
+      "backbone_width": 0.5, "head_width": 0.5}, 2_645_305),
+], ids=str)  # fmt: skip
+def test_numbers_of_parameters(make_spec, options, count):
+    assert num_parameters(build_network(make_spec(**options))) == count
 
 
 def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
@@ -199,14 +198,6 @@ def test_belief_and_field_share_only_the_trunk():
     # A block's convolutions, the first's shortcut; a 3×3 and a 1×1 of each branch.
     weights = 9 * (8 * 24 + 5 * 24 * 24) + 8 * 24 + 24 * (18 + 32)
     assert sum(p.numel() for p in head.parameters() if p.ndim == 4) == weights
-
-
-@pytest.mark.parametrize(
-    ("channels", "width", "expected"),
-    [(128, 1, 128), (128, 0.5, 64), (64, 0.3, 16), (64, 1 / 64, 8), (512, 4, 2048)],
-)
-def test_scaled_channels(channels, width, expected):
-    assert scaled_channels(channels, width) == expected
 
 
 @pytest.mark.parametrize("half", [False, True])

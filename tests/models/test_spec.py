@@ -7,7 +7,7 @@ from torch import nn
 
 from dopepp.core.errors import UserError
 from dopepp.models import backbones
-from dopepp.models.network import BACKBONES, LOSSES, PoseNetwork, architecture, build_network
+from dopepp.models.network import BACKBONES, LOSSES, PoseNetwork, build_network
 from dopepp.models.registry import Registry
 
 OPTIMIZERS = Registry("optimizer", torch.optim.Optimizer, ["torch.optim.AdamW", "torch.optim.SGD"])
@@ -195,12 +195,3 @@ def test_a_class_may_accept_any_keywords(monkeypatch, tiny_module):
     for name, value in (("path", "there"), ("_partial_", True)):
         with pytest.raises(UserError, match=f"argument '{name}'"):
             registry.build({**node, name: value}, path="here")
-
-
-def test_architecture_drops_the_pretrained_weights(make_spec):
-    spec = make_spec("VGG19", backbone_weights_path="/home/somebody/vgg19.pth")
-    plain = architecture(spec)
-    assert "weights_path" not in plain["backbone"]
-    assert spec["backbone"]["weights_path"] == "/home/somebody/vgg19.pth"
-    plain["head"]["width"] = 2
-    assert "width" not in spec["head"]

@@ -4,10 +4,10 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.models import start
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.models.start import start_from_checkpoint, start_from_parts
-from dopepp.models.storage import read_safetensors
+from dopepp.models.storage import read_safetensors, write_atomic
 from dopepp.parts.part import Mesh, make_part
 from tests.models.conftest import assert_weights, weights_of
 

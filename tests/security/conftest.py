@@ -14,8 +14,9 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Mesh, make_part
 
 MOST_MB = 400

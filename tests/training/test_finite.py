@@ -17,11 +17,11 @@ from torch import Tensor
 from torch.optim.lr_scheduler import OneCycleLR
 from torch.utils.data import DataLoader
 
-from dopepp.core.errors import RunError, UserError
+from dopepp.core.errors import RunError
 from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
 from dopepp.drawing.pictures import read_rgb
-from dopepp.training.guards import FOLDER, EmptyMaps, FiniteSteps
+from dopepp.training.guards import FOLDER, FiniteSteps
 from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem, check_state
 
@@ -218,14 +218,6 @@ def test_only_finite_weights_and_optimiser_states_are_saved(value):
     moments = {"state": {0: {"exp_avg": bad}}, "param_groups": [{"lr": 1.0}]}
     with pytest.raises(RunError, match="the optimiser's state"):
         check_state({"state_dict": good, "optimizer_states": [moments]})
-
-
-@pytest.mark.parametrize("count", [0, -1, 1.5, True, "ten"])
-def test_an_invalid_count_is_refused(count):
-    with pytest.raises(UserError, match="max_in_a_row"):
-        FiniteSteps(count)
-    with pytest.raises(UserError, match="patience"):
-        EmptyMaps(count)
 
 
 SCRIPT = """

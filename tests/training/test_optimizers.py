@@ -82,16 +82,3 @@ def test_a_resumed_run_is_exact():
     resumed.load_state_dict(muon.state_dict())
     run(second, resumed, range(5, 10))
     assert all(torch.equal(a, b) for a, b in zip(whole, second, strict=True))
-
-
-def test_the_closure_is_called_with_gradients():
-    weight = nn.Parameter(torch.ones(2, 2))
-    optimizer = Muon([weight], lr=0.1)
-
-    def closure():
-        loss = weight.square().sum()
-        loss.backward()
-        return loss.item()
-
-    assert optimizer.step(closure) == 4.0
-    assert (weight < 1).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -29,7 +28,7 @@ PAPER_OBJECTS: Final = (
 def build_parts(data: DataConfig) -> list[Part]:
     """Load the parts to learn, from ``data.root`` or ``data.parts``, with their symmetries.
 
-    With a camera and ``data.symmetries=auto``, a part may differ from its rotated copy by a pixel.
+    With a camera, a part with ``data.symmetries=auto`` may differ from its rotated copy by a pixel.
     """
     view = data.virtual.view
     resolution = 0.0 if view is None else view.resolution
@@ -47,27 +46,24 @@ def _read_parts(data: DataConfig) -> list[Part]:
                     "set data.root, or use data.parts",
                 )
     elif data.format == "ycb_video":
-        return _ycb_parts(data.root, data.objects)
+        classes = read_classes(data.root)
+        names = PAPER_OBJECTS if data.objects is None else data.objects
+        if unknown := [name for name in names if name not in classes]:
+            fix = "set data.objects to one or more of these names"
+            raise UserError(f"data.objects with {unknown[0]!r}", ", ".join(classes), fix)
+        return [ycb_part(data.root, name) for name in names]
     elif data.format in ("bop", "webdataset"):
         return bop_parts(data.root, data.objects)
     return [load_part(name, data.unit) for name in data.parts]
 
 
-def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
-    """Load YCB objects by name; None selects :data:`PAPER_OBJECTS`."""
-    classes = read_classes(root)
-    names = PAPER_OBJECTS if objects is None else objects
-    unknown = [name for name in names if name not in classes]
-    if unknown:
-        fix = "set data.objects to one or more of these names"
-        raise UserError(f"data.objects with {unknown[0]!r}", ", ".join(classes), fix)
-    return [ycb_part(root, name) for name in names]
-
-
 def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
     """Load the parts that renders show unlabelled: ``virtual.negatives``, other models of BOP."""
-    names = data.virtual.negatives
-    listed = [_negative(name, data.unit, _modification_time(name)) for name in names]
+    listed = []
+    for name in data.virtual.negatives:
+        path = Path(name)
+        changed_at = path.stat().st_mtime_ns if path.is_file() else 0  # 0 for a built-in part
+        listed.append(_negative(name, data.unit, changed_at))
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
     hashes = {part.mesh_hash for part in (*parts, *listed)}
@@ -75,18 +71,9 @@ def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
 
 
 @lru_cache(maxsize=16)
-def _negative(name: str, unit: str | None, modified: int) -> Part:
-    """Load a part, once per process, so that messages about its mesh appear once.
-
-    A file with another modification time ``modified`` (nanoseconds) is read again.
-    """
+def _negative(name: str, unit: str | None, changed_at: int) -> Part:
+    """Load a part once per process and state of its file, so that messages appear once."""
     return load_part(name, unit)
-
-
-def _modification_time(name: str) -> int:
-    """Return the modification time of a part's file, nanoseconds; 0 for a built-in part."""
-    path = Path(name)
-    return path.stat().st_mtime_ns if path.is_file() else 0
 
 
 @lru_cache(maxsize=1)

@@ -1,8 +1,7 @@
 """Build the DataModule, the images of each split and their camera from the ``data`` config.
 
-The images of a split are labelled images or renders. To add a format of labelled images, write a
-source and add it to :data:`FORMATS`, or publish an :data:`Opener` as an entry point
-``dopepp.formats`` of your own package (:mod:`dopepp.core.extensions`).
+To add a format of labelled images, write a source and add it to :data:`FORMATS`, or publish an
+:data:`Opener` as an entry point ``dopepp.formats`` (:mod:`dopepp.core.extensions`).
 """
 
 from __future__ import annotations
@@ -45,12 +44,6 @@ from dopepp.virtual.backgrounds import Backgrounds
 
 _log = logging.getLogger(__name__)
 
-_TRAINING_SHARE: Final = 0.8
-"""Share of training in an image folder that is also used for validation or test."""
-
-_DIVIDED: Final = ("bop", "ndds", "webdataset")
-"""Formats whose folders :func:`share_of` divides between the splits."""
-
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build the DataModule. ``seed`` determines the training images, ``eval_seed`` the others."""
@@ -78,7 +71,6 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Build the validation or test images at their native resolution.
 
-    :meth:`DataConfig.is_rendered` selects renders or the labelled images of ``data.root``.
     Validation falls back to renders, with a warning, if no labelled image shows a part.
     """
     if data.is_rendered(split):
@@ -102,13 +94,13 @@ def _train_source(
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
         real = _real_frames(data, parts, seed)
+    elif data.real_fraction == 1:
+        raise UserError(
+            f"data={data.name} without data.root",
+            f"a folder in the format {data.format}, because only labelled images are used",
+            "set data.root, or train on renders with data=virtual",
+        )
     elif data.real_fraction > 0:
-        if data.real_fraction == 1:
-            raise UserError(
-                f"data={data.name} without data.root",
-                f"a folder in the format {data.format}, because only labelled images are used",
-                "set data.root, or train on renders with data=virtual",
-            )
         _log.warning(
             "no real images (data.root is not set): training on renders of %s only",
             ", ".join(part.name for part in parts),
@@ -116,16 +108,9 @@ def _train_source(
     if data.synthetic_fraction > 0 and data.real_fraction < 1:
         synthetic = _synthetic_images(data, parts, seed, backgrounds)
     virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed, backgrounds)
-    return HybridSource(
-        real,
-        virtual,
-        data.real_fraction if real is not None else 0.0,
-        data.samples_per_epoch,
-        seed,
-        synthetic,
-        data.synthetic_fraction,
-        name=data.name,
-    )
+    share = data.real_fraction if real is not None else 0.0
+    mix = (real, virtual, share, data.samples_per_epoch, seed, synthetic, data.synthetic_fraction)
+    return HybridSource(*mix, name=data.name)
 
 
 def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
@@ -140,11 +125,7 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
 
 
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
-    """Open the labelled images of a split in ``data.root``, with ``seed`` for random choices.
-
-    Raises:
-        UserError: ``data.format`` is unknown, or ``data.root`` has no images of the split.
-    """
+    """Open the labelled images of a split in ``data.root``, with ``seed`` for random choices."""
     assert data.root is not None
     if data.format in FORMATS:
         return FORMATS[data.format](data, data.root, parts, seed, split)
@@ -166,25 +147,18 @@ def _synthetic_images(
         return None
     if not read_image_set(data.root, image_set, "synthetic"):
         return None
-    return YcbVideoReader(
-        data.root,
-        parts,
-        image_set,
-        "synthetic",
-        backgrounds=backgrounds,
-        seed=seed,
-        read_depth=False,
-    )
+    chosen = (data.root, parts, image_set, "synthetic")
+    return YcbVideoReader(*chosen, backgrounds=backgrounds, seed=seed, read_depth=False)
 
 
 def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
     """Return the range of a folder's images that a split uses, as two fractions of the folder.
 
-    Splits with the same ``image_sets`` entry divide the folder in the order training, validation,
-    test. Training gets 80 %; the remaining splits get equal shares.
+    Splits of one folder divide it in the order training, validation, test. Training gets 80 %; the
+    remaining splits get equal shares.
     """
     sharing = [name for name in ("train", "val", "test") if image_sets[name] == image_sets[split]]
-    first = _TRAINING_SHARE if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)
+    first = 0.8 if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)
     borders = [0.0, first]
     for number in range(1, len(sharing)):
         borders.append(first + (1 - first) * number / (len(sharing) - 1))
@@ -234,7 +208,7 @@ FORMATS: Final[dict[str, Opener]] = {
 
 def note_on_shared_folder(data: DataConfig) -> str | None:
     """Return a remark if other splits use a share of the test images' folder, else None."""
-    if data.is_rendered("test") or data.format not in _DIVIDED:
+    if data.is_rendered("test") or data.format not in ("bop", "ndds", "webdataset"):
         return None
     first, last = share_of(data.image_sets, "test")
     if last - first == 1:
@@ -254,9 +228,6 @@ def fit_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
 
     Without ``virtual.camera``, renders for a BOP data set use the camera of its test images. With
     neither camera, the config is returned unchanged. The chosen values are logged.
-
-    Raises:
-        UserError: A part is larger than ``data.input_size``, or the working distance is unknown.
     """
     config = _with_camera_of_images(config, parts)
     data, virtual = config.data, config.data.virtual

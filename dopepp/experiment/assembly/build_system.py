@@ -9,11 +9,10 @@ from __future__ import annotations
 import ctypes
 import inspect
 import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
@@ -25,9 +24,8 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from dopepp.core.errors import UserError
 from dopepp.core.pool import cpu_fact
-from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
-from dopepp.experiment.config.run_config import AUTO, RunConfig, TrainerConfig
+from dopepp.experiment.config.run_config import AUTO, RunConfig
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
@@ -45,20 +43,6 @@ from dopepp.training.throughput import RunProgress, make_profiler
 
 T = TypeVar("T")
 
-# From glibc's malloc.h.
-_M_TRIM_THRESHOLD: Final = -1
-_M_MMAP_MAX: Final = -4
-
-_PROBE_ITEMS: Final = 3
-_PROBE_S: Final = 2.0
-"""Number of loaded items and seconds of a timed step, for the estimate of a run's duration."""
-
-_BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})
-"""Names of the instruction sets on x86 and Arm."""
-
-_AMD_BF16_FLAG: Final = "avx512_bf16"
-"""Instruction set that makes bf16 fast on AMD only. On Intel, AVX-512 bf16 is slower than float32,
-and AMX is needed instead (``benchmarks/train_step.py``)."""
 
 OPTIMIZERS: Registry[Optimizer] = Registry(
     "optimizer",
@@ -99,9 +83,6 @@ LOGGERS: Registry[Logger] = Registry(
     ("lightning.pytorch.loggers.TensorBoardLogger", "lightning.pytorch.loggers.WandbLogger"),
 )
 
-_TOTAL_STEPS = ("total_steps", "T_max", "total_iters")
-"""Names that torch's schedulers use for the number of steps of a run."""
-
 
 def build_system(
     config: RunConfig,
@@ -112,8 +93,8 @@ def build_system(
 ) -> PoseSystem:
     """Build the LightningModule: initialised network, loss, optimiser and schedule.
 
-    Checkpoints store ``fingerprint`` (hash of the data), ``images`` (description of each split's
-    images) and ``seen`` (trained range of sizes and distances by part).
+    Checkpoints store ``fingerprint``, a hash of the data, and by split and part the descriptions of
+    ``images`` and the trained sizes and distances ``seen``.
     """
     network, description = build_untrained(config, parts)
     description = replace(
@@ -127,7 +108,14 @@ def build_system(
         data_fingerprint=fingerprint,
         seen=dict(seen or {}),
     )
-    _initialise(network, config)
+    if config.init_from == AUTO:
+        fits = start_from_parts(network)
+        if config.resume is None and is_rank_zero():
+            default = f"default, because the weights of random parts fit only {FITS}"
+            chosen = "learned on random parts (init_from=auto)" if fits else default
+            program.print_line(f"initial weights: {chosen}")
+    elif config.init_from is not None:
+        start_from_checkpoint(network, Path(config.init_from))
     return PoseSystem(
         network,
         LOSSES.build(config.model.loss),
@@ -140,22 +128,6 @@ def build_system(
         compile_network=config.compile,
         symmetry=config.symmetry,
     )
-
-
-def _initialise(network: PoseNetwork, config: RunConfig) -> None:
-    """Copy the weights of ``init_from`` into the network; for ``auto``, print the choice."""
-    if config.init_from is None:
-        return
-    if config.init_from != AUTO:
-        start_from_checkpoint(network, Path(config.init_from))
-        return
-    fits = start_from_parts(network)
-    if config.resume is None and is_rank_zero():
-        program.print_line(
-            "initial weights: learned on random parts (init_from=auto)"
-            if fits
-            else f"initial weights: default, because the weights of random parts fit only {FITS}"
-        )
 
 
 def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
@@ -180,16 +152,9 @@ def build_trainer(
     trackers: Sequence[Logger] = (),
     further: Sequence[Callback] = (),
 ) -> Trainer:
-    """Build Lightning's trainer with the callbacks, the CSV table and the trackers.
+    """Build Lightning's trainer with the CSV table, and the callbacks of the config.
 
-    Args:
-        config: Config of the run.
-        run_dir: Folder of the run.
-        trackers: Loggers besides the table.
-        further: Callbacks besides those of the config.
-
-    Raises:
-        UserError: An option of the trainer or of a callback is invalid.
+    ``trackers`` and ``further`` are additional loggers and callbacks.
     """
     options, accelerator = config.trainer, config.trainer.accelerator
     if accelerator in ("auto", "gpu") and torch.cuda.is_available():
@@ -238,19 +203,19 @@ def build_trainer(
 def choose_precision(requested: str, accelerator: str) -> tuple[str, str]:
     """Return Lightning's name of the precision, and the reason for the choice.
 
-    ``auto`` selects bf16 if the hardware supports it, because emulation is slow. The choice depends
-    on the hardware only, not on timings, so runs are repeatable.
+    ``auto`` selects bf16 if the hardware supports it; the choice depends on no timings.
     """
     if requested != "auto":
         return requested, "as requested"
     if accelerator == "cuda":
-        fast = torch.cuda.is_bf16_supported(including_emulation=False)
-        if fast:
+        if torch.cuda.is_bf16_supported(including_emulation=False):
             return "bf16-mixed", "this GPU supports bf16"
         return "32-true", "this GPU has no bf16"
     if accelerator != "cpu":
         return "32-true", f"bf16 support is not checked on {accelerator}"
-    useful = _BF16_FLAGS | ({_AMD_BF16_FLAG} if cpu_fact("vendor_id") == "AuthenticAMD" else set())
+    useful = {"amx_bf16", "bf16"}  # on x86 and Arm
+    if cpu_fact("vendor_id") == "AuthenticAMD":
+        useful.add("avx512_bf16")  # on Intel slower than float32 (benchmarks/train_step.py)
     fast = useful & set(cpu_fact("flags", "Features").split())
     if fast:
         return "bf16-mixed", f"this CPU has fast bf16 instructions ({', '.join(sorted(fast))})"
@@ -261,74 +226,18 @@ def choose_precision(requested: str, accelerator: str) -> tuple[str, str]:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc reuse large blocks instead of returning them to the system after each operation.
+    """Let glibc reuse large blocks, because page faults slow training on a CPU down.
 
-    By default every large tensor is mapped again, and page faults slow training on a CPU down
-    (``benchmarks/train_step.py``).
+    By default every large tensor is mapped again (``benchmarks/train_step.py``).
     """
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
         libc = ctypes.CDLL(None)
-        libc.mallopt(_M_MMAP_MAX, 0)
-        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
-
-
-def estimate_training_s(
-    network: PoseNetwork, datamodule: PoseDataModule, trainer: TrainerConfig, precision: str
-) -> float:
-    """Estimate the duration of a run on a CPU, in seconds, from a few steps and items.
-
-    Loading and training share the cores, so their times add up. Items are loaded twice, because a
-    cache accelerates all epochs after the first epoch.
-    """
-    per_epoch = len(datamodule.train_source)
-    num_images = per_epoch * trainer.max_epochs
-    if trainer.max_steps > 0:
-        num_images = min(num_images, trainer.max_steps * datamodule.batch_size)
-    threads = max(1, torch.get_num_threads())
-    first, second = (_loading_s(datamodule) / threads for _ in range(2))
-    num_first = min(num_images, per_epoch)
-    loading = first * num_first + second * (num_images - num_first)
-    return _step_s_per_image(network, datamodule, precision) * num_images + loading
-
-
-def _loading_s(datamodule: PoseDataModule) -> float:
-    """Return the mean time to load one of the first training items in this process, seconds."""
-    items = min(_PROBE_ITEMS, len(datamodule.train_source))
-    start = time.perf_counter()
-    for index in range(items):
-        datamodule.train_item(0, index)
-    return (time.perf_counter() - start) / items
-
-
-def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precision: str) -> float:
-    """Return the seconds per image of a forward and backward pass that takes at most 2 s."""
-    width, height = datamodule.input_size
-
-    def step_s(count: int) -> float:
-        images = torch.zeros(count, 3, height, width).to(memory_format=torch.channels_last)
-        start = time.perf_counter()
-        with torch.autocast("cpu", torch.bfloat16, enabled=precision.startswith("bf16")):
-            stages = network(images)
-        means = [tensor.float().mean() for stage in stages for tensor in stage]
-        torch.autograd.backward(torch.stack(means).sum())
-        return time.perf_counter() - start
-
-    network.eval()  # keeps batch norm's statistics unchanged
-    step_s(1)  # warm-up: selects kernels and allocates memory
-    single = step_s(1)
-    count = max(1, min(datamodule.batch_size, int(_PROBE_S / single)))
-    step_s(count)
-    duration = step_s(count) / count
-    network.zero_grad(set_to_none=True)
-    network.train()
-    return duration
+        libc.mallopt(-4, 0)  # M_MMAP_MAX
+        libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 def optimizer_factory(node: Mapping[str, Any]) -> OptimizerFactory:
-    """Return a function from parameters to the optimiser that a node describes.
-
-    The node is checked immediately with a dummy parameter, so mistakes are reported at the start.
-    """
+    """Return a function from parameters to the optimiser of a node, which is checked at once."""
 
     def make(parameters: Iterable[nn.Parameter]) -> Optimizer:
         return OPTIMIZERS.build(node, params=list(parameters))
@@ -342,7 +251,7 @@ def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
     if node.get(TARGET) is None:
         return None
     parameters = inspect.signature(SCHEDULERS.resolve(node[TARGET])).parameters
-    total = next(name for name in _TOTAL_STEPS if name in parameters)
+    total = next(name for name in ("total_steps", "T_max", "total_iters") if name in parameters)
 
     def make(optimizer: Optimizer, num_steps: int) -> LRScheduler:
         try:

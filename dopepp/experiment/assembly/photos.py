@@ -28,11 +28,7 @@ _NEEDED: Final = f"at least {3 * MIN_PHOTOS} different photos"
 
 
 def training_backgrounds(data: DataConfig) -> Backgrounds:
-    """Return the training backgrounds: ``virtual.backgrounds``, and ``negative_photos`` if set.
-
-    Raises:
-        UserError: A folder has no photo, or there are too few negative photos.
-    """
+    """Return the training backgrounds: ``virtual.backgrounds``, and ``negative_photos`` if set."""
     backgrounds = find_backgrounds(data.virtual.backgrounds, "train")
     if isinstance(backgrounds, PhotoBackgrounds) and not backgrounds.is_divided:
         _log.warning(
@@ -50,11 +46,7 @@ def training_backgrounds(data: DataConfig) -> Backgrounds:
 
 
 def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBackgrounds:
-    """Return held-out photos of ``virtual.backgrounds``; the package's if those are procedural.
-
-    Raises:
-        UserError: The folder of the backgrounds has too few photos to be divided.
-    """
+    """Return held-out photos of ``virtual.backgrounds``; the package's if those are procedural."""
     photos = find_backgrounds(data.virtual.backgrounds, split)
     if not isinstance(photos, PhotoBackgrounds):
         return shipped_photos(split)
@@ -69,11 +61,7 @@ def held_out_photos(data: DataConfig, split: Literal["val", "test"]) -> PhotoBac
 
 
 def negative_photos(data: DataConfig, split: PhotoSplit) -> PhotoBackgrounds | None:
-    """Return a split of the images in ``virtual.negative_photos``; None without that folder.
-
-    Raises:
-        UserError: There are too few images to be divided.
-    """
+    """Return a split of the images in ``virtual.negative_photos``; None without that folder."""
     folder = data.virtual.negative_photos
     if folder is None:
         return None

@@ -42,11 +42,7 @@ def held_out_renders(
 ) -> DescribedSource:
     """Return the renders of the validation or test split, at the camera's full resolution.
 
-    Args:
-        data: Config of objects and images.
-        parts: Parts to render and label.
-        split: ``val`` or ``test``.
-        scale: Factor by which the distance to the parts is divided.
+    The distance to the parts is divided by ``scale``.
     """
     renderer, count = data.virtual.renderer, data.num_val
     cache: Cache = "none"
@@ -62,32 +58,23 @@ def held_out_renders(
 
 
 def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
-    """Return the test scenes rendered with the distance to the parts divided by ``scale``.
-
-    Raises:
-        UserError: The test images are not renders.
-    """
-    if not data.is_rendered("test"):
-        raise UserError(
-            f"scale={scale:g} on the images in data.root={data.root}",
-            "renders, because photographs have a fixed camera",
-            "leave out scale, or test on renders of these objects with data.test.renderer=raster",
-        )
-    return held_out_renders(data, parts, "test", scale)
+    """Return the test scenes rendered with the distance to the parts divided by ``scale``."""
+    if data.is_rendered("test"):
+        return held_out_renders(data, parts, "test", scale)
+    raise UserError(
+        f"scale={scale:g} on the images in data.root={data.root}",
+        "renders, because photographs have a fixed camera",
+        "leave out scale, or test on renders of these objects with data.test.renderer=raster",
+    )
 
 
 def validation_renders(
     checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
 ) -> DescribedSource:
-    """Render the parts of a checkpoint as in its validation images.
+    """Render the parts of a checkpoint as in its validation images, without its data set.
 
-    The training's data set is not needed; other models of the data set are not shown.
-
-    Args:
-        checkpoint: Checkpoint with the parts and the options of the renders.
-        path: Path of the checkpoint, for messages.
-        count: Number of images.
-        size: (width, height), pixels; ignored if the checkpoint was trained for a camera.
+    ``path`` of the checkpoint is for messages. ``size`` (width, height), pixels, is ignored if the
+    checkpoint was trained for a camera.
     """
     data = evaluation_data({}, {}, stored_config(checkpoint.data), str(path))
     virtual = replace(data.virtual, preset=data.preset_name)
@@ -101,11 +88,7 @@ def validation_renders(
 def with_cache(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Cache a source's images, resized to fit ``input_size``, unless ``cache`` is ``none``.
-
-    Raises:
-        UserError: The cache does not fit into the memory or on the disk.
-    """
+    """Cache a source's images, resized to fit ``input_size``, unless ``cache`` is ``none``."""
     if cache == "none":
         return source
     folder = None
@@ -132,11 +115,5 @@ def _factory(
     renderer: str | None = None,
 ) -> Factory:
     """Return the factory that renders a preset's scenes, with parts of :func:`build_negatives`."""
-    return Factory(
-        parts,
-        preset,
-        seed,
-        backgrounds,
-        renderer=renderer or data.virtual.renderer,
-        negatives=build_negatives(data, parts),
-    )
+    negatives, renderer = build_negatives(data, parts), renderer or data.virtual.renderer
+    return Factory(parts, preset, seed, backgrounds, renderer=renderer, negatives=negatives)

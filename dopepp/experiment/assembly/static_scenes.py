@@ -1,7 +1,4 @@
-"""Test images of static scenes, each with further images of its scene.
-
-The optical axes of the chosen cameras differ by about :data:`ANGLE_DEG`.
-"""
+"""Test images of static scenes, each with further images of its scene."""
 
 from __future__ import annotations
 
@@ -17,20 +14,11 @@ from dopepp.data.sample import DescribedSource, Sample, SourceInfo
 from dopepp.geometry.camera import Transform
 from dopepp.inference.several_views.view_files import CameraPoses, read_camera_poses
 
-ANGLE_DEG: Final = 25.0
-"""Preferred angle between the optical axes of two cameras, degrees."""
+ANGLE_DEG: Final = 25.0  # preferred angle between the optical axes of chosen cameras, degrees
 
 
 class StaticScenes:
-    """Images of a BOP split, each with further images of its scene and all camera poses.
-
-    Args:
-        reader: Reader of the images; every folder is a static scene.
-        num_views: Number of images of each item, including the item's main image.
-
-    Raises:
-        UserError: A scene has no camera poses, or too few images.
-    """
+    """Images of a BOP split, a folder per static scene, each with further images of its scene."""
 
     def __init__(self, reader: BopReader, num_views: int) -> None:
         self._reader, self._num_others, self.name = reader, num_views - 1, reader.name
@@ -82,12 +70,7 @@ class StaticScenes:
 
 
 def with_views(source: DescribedSource, num_views: int) -> DescribedSource:
-    """Return test images with further images of their scenes.
-
-    Raises:
-        UserError: The images are not a BOP data set with camera poses, or a scene has too few
-            images.
-    """
+    """Return test images with further images of their scenes."""
     if isinstance(source, BopReader):
         return StaticScenes(source, num_views)
     raise UserError(

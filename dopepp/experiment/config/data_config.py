@@ -27,14 +27,12 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 16384)]
 
-MAX_WORKERS: Final = 1024
-"""Maximum number of loader processes."""
+MAX_WORKERS: Final = 1024  # maximum number of loader processes
 
-_MULTIPLE: Final = 32
-"""Both sides of the network's input are multiples of this number of pixels."""
+_MULTIPLE: Final = 32  # both sides of the network's input are multiples of this number of pixels
 
+# Nodes to which an evaluation cannot add options.
 _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_sets")
-"""Nodes to which an evaluation cannot add options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,20 +94,12 @@ class VirtualConfig:
 
     @classmethod
     def of(cls, node: object) -> VirtualConfig:
-        """Parse the node ``virtual``, including the camera and preset files that it names.
-
-        Raises:
-            UserError: An option is unknown or invalid.
-        """
+        """Parse the node ``virtual``, including the camera and preset files that it names."""
         return parse(cls, with_files(node or {}), "virtual")
 
     @property
     def view(self) -> View | None:
-        """Camera with its working distance; None if the preset's camera is used.
-
-        Raises:
-            UserError: Only one of camera and working distance is set, or a value is invalid.
-        """
+        """Camera with its working distance; None if the preset's camera is used."""
         if self.camera is None and self.working_distance is None:
             return None
         if self.camera is None or self.working_distance is None:
@@ -213,15 +203,11 @@ class DataConfig:
     eval_seed: Seed
     input_size: tuple[int, int] | None
     batch_size: Count
-    num_workers: Annotated[int, Range(0, MAX_WORKERS)] | None
+    num_workers: Annotated[int, Range(0, 1024)] | None
 
     @classmethod
     def of(cls, data: object, virtual: object) -> DataConfig:
-        """Parse the nodes ``data`` and ``virtual``; None for ``virtual`` selects its defaults.
-
-        Raises:
-            UserError: An option is unknown, missing, of a wrong type or out of range.
-        """
+        """Parse the nodes ``data`` and ``virtual``; None for ``virtual`` selects its defaults."""
         if isinstance(data, Mapping) and "virtual" in data:
             problem = f"data.virtual={short_repr(data['virtual'])}"
             raise UserError(problem, "virtual.…", "write virtual.… instead of data.virtual.…")
@@ -249,11 +235,7 @@ class DataConfig:
 
     @property
     def network_input(self) -> tuple[int, int]:
-        """(width, height) of the network's input, pixels.
-
-        Raises:
-            UserError: ``input_size`` is neither set nor derived from a camera.
-        """
+        """(width, height) of the network's input, pixels."""
         if self.input_size is None:
             raise UserError(
                 "neither data.input_size nor a camera",
@@ -269,11 +251,7 @@ class DataConfig:
         return self.image_sets[split] is None
 
     def image_set(self, split: Split) -> str:
-        """Return the image set (YCB-Video) or folder below ``root`` (other formats) of a split.
-
-        Raises:
-            UserError: The split has no image set.
-        """
+        """Return the image set (YCB-Video) or folder below ``root`` (other formats) of a split."""
         chosen = self.image_sets[split]
         if chosen is None:
             raise UserError(
@@ -294,9 +272,6 @@ def evaluation_data(
         virtual: Whole node ``virtual`` (with renderer and preset), or options to change.
         stored: Data config of the checkpoint; any value, because a file is not trusted.
         source: Path of the checkpoint, for messages.
-
-    Raises:
-        UserError: Neither the user nor the checkpoint names the data, or an option is invalid.
     """
     given, base = data or {}, stored if isinstance(stored, dict) else {}
     whole = "name" in given  # a file of conf/data, not single options
@@ -323,17 +298,13 @@ def evaluation_data(
 
 
 def stored_config(description: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the data config in a checkpoint's ``data``, or None if ``data`` contains no config."""
+    """Return the data config in the entry ``data`` of a checkpoint, or None without any."""
     config = description.get("config")
     return config if isinstance(config, dict) else None
 
 
 def with_files(virtual: object) -> object:
-    """Return the node ``virtual`` with file paths replaced by the contents of the files.
-
-    A camera file becomes the fields of :class:`LensConfig`; a preset file becomes changes to a
-    built-in preset.
-    """
+    """Return the node ``virtual`` with the contents of its camera and preset files."""
     if not isinstance(virtual, Mapping):
         return virtual
     written = dict(virtual)

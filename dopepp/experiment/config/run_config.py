@@ -24,24 +24,14 @@ C = TypeVar("C", bound="MeasurementConfig")
 
 _MOST: Final = 10**6
 _MAX_EPOCHS: Final = 10**9
-_MAX_WAIT_S: Final = 7 * 24 * 3600
-_MIN_CELLS: Final = 0.1
-"""Minimum width of a peak or disc in cells; a narrower peak may cover no cell."""
-_MAX_THRESHOLD: Final = 1000
-"""Maximum width of a peak or disc in cells."""
 
-AUTO: Final = "auto"
-"""Value of ``init_from`` that selects the package's initial weights if they fit."""
+AUTO: Final = "auto"  # value of `init_from` that selects the package's initial weights if they fit
 
-Cells = Annotated[float, Range(_MIN_CELLS, _MAX_THRESHOLD)]
+Cells = Annotated[float, Range(0.1, 1000)]  # a narrower peak may cover no cell
 Rate = Annotated[float, Range(1e-12, 1e3)]
 
 
-QuantityName = Literal["distance", "visibility", "size", "rotation"]
-"""Quantities by which rates can be broken down (``dopepp.experiment.results.breakdown``)."""
-
-_MAX_SCALE: Final = 20.0
-"""Largest factor by which the camera moves nearer or farther."""
+QuantityName = Literal["distance", "visibility", "size", "rotation"]  # of `results.breakdown`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +96,7 @@ class TrainerConfig:
     max_epochs: Annotated[int, Range(1, _MAX_EPOCHS)]
     max_steps: Annotated[int, Range(-1, _MAX_EPOCHS)] = -1
     profiler: Literal["simple", "pytorch"] | None = None
-    ddp_timeout_s: Annotated[float, Range(1, _MAX_WAIT_S)] = 1800.0
+    ddp_timeout_s: Annotated[float, Range(1, 7 * 24 * 3600)] = 1800.0
     lightning: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -118,12 +108,7 @@ class TrainerConfig:
 
     @property
     def num_processes(self) -> int:
-        """Number of training processes on all machines.
-
-        Raises:
-            UserError: ``trainer.devices`` is invalid.
-        """
-        # torchrun states the number of processes that it has started.
+        """Number of training processes on all machines, also if torchrun has started them."""
         world_size = os.environ.get("WORLD_SIZE", "")
         outside = int(world_size) if world_size.isdecimal() else 1
         return max(outside, self.num_nodes * self._num_devices())
@@ -168,9 +153,6 @@ class LearningRateConfig:
         min_lr: Learning rate of the first step.
         max_lr: Learning rate of the last step.
         num_steps: Number of steps; fewer if the loss diverges.
-
-    Raises:
-        UserError: ``max_lr`` is not above ``min_lr``.
     """
 
     __pydantic_config__ = STRICT
@@ -218,13 +200,9 @@ class Protocols:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Protocols:
-        """Read the options from a config; ``scale_factors`` may be absent.
-
-        Raises:
-            UserError: An option is invalid.
-        """
+        """Read the options from a config; ``scale_factors`` may be absent."""
         shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
-        bounds = (1 / _MAX_SCALE, _MAX_SCALE)
+        bounds = (1 / 20, 20)
         factors = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
         return cls(
             shading=_levels("shading", config["shading"], (0, 1), 0, shares),
@@ -362,11 +340,7 @@ class RunConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
-        """Parse a config that Hydra has composed and resolved.
-
-        Raises:
-            UserError: An option is unknown, missing or invalid.
-        """
+        """Parse a config that Hydra has composed and resolved."""
         plain = {**config, "virtual": with_files(config.get("virtual"))}
         data = DataConfig.of(plain.get("data"), plain["virtual"])
         options = {key: value for key, value in plain.items() if key != "virtual"}
@@ -419,11 +393,7 @@ class EvaluationConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:
-        """Parse a config that Hydra has composed and resolved.
-
-        Raises:
-            UserError: An option is unknown, missing or invalid.
-        """
+        """Parse a config that Hydra has composed and resolved."""
         return _parsed(cls, config)
 
 

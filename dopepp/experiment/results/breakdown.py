@@ -27,32 +27,29 @@ from dopepp.experiment.results.frame import (
     Value,
     interval,
     pivot,
-    radius_note,
     rate_curves,
 )
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics, matching_radius
+from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics
 
 _log = logging.getLogger(__name__)
 
-Numbers = Float[np.ndarray, "n"]
-"""One number per instance."""
+Numbers = Float[np.ndarray, "n"]  # one number per instance
 
 
 class Quantity(NamedTuple):
-    """Quantity to bin instances by: heading with unit, value per instance, decimals in tables."""
+    """Quantity to bin instances by."""
 
-    heading: str
+    heading: str  # with unit
     of: Callable[[EvaluatedInstances], Numbers]
-    decimals: int
+    decimals: int  # in tables
 
 
 def sizes(instances: EvaluatedInstances) -> Numbers:
     """Return the square root of the area of the projected cuboid, in pixels of the original image.
 
-    Occluded and truncated regions count. Unlike the distance, the size reveals that a flat part is
-    seen edge-on.
+    Hidden regions count. Unlike the distance, the size reveals a flat part that is seen edge-on.
     """
     areas = []
     for T, K in zip(instances.T_gt.numpy(), instances.K.numpy(), strict=True):
@@ -64,10 +61,7 @@ def sizes(instances: EvaluatedInstances) -> Numbers:
 
 
 def view_angles(instances: EvaluatedInstances) -> Numbers:
-    """Return the angle between the object's +z axis and the direction to the camera, degrees.
-
-    At 0° the +z face of the cuboid faces the camera; at 90° the face is seen edge-on.
-    """
+    """Return the angle between the object's +z axis and the direction to the camera, degrees."""
     towards_camera, axes = -_centres(instances), instances.T_gt.numpy()[:, :3, 2]
     across = np.linalg.norm(np.cross(axes, towards_camera), axis=1)
     return np.asarray(np.degrees(np.arctan2(across, (axes * towards_camera).sum(axis=1))))
@@ -91,8 +85,8 @@ QUANTITIES: Final[dict[QuantityName, Quantity]] = {
 def bin_numbers(numbers: Numbers, num_bins: int) -> Int[np.ndarray, "n"]:
     """Assign numbers to bins of equal counts, numbered from 0; equal numbers share a bin.
 
-    The mean rank of a number determines its bin, so a large group of equal numbers (such as
-    unoccluded objects) does not pull other numbers into its bin. Empty bins are omitted.
+    The mean rank of a number determines its bin, so a large group of equal numbers does not pull
+    other numbers into its bin. Empty bins are omitted.
     """
     middles = pd.Series(numbers, dtype=float).rank() - 0.5
     bins = np.floor(middles * num_bins / max(len(numbers), 1))
@@ -118,9 +112,8 @@ def break_down(
     The last method is measured on all objects, so its instances determine the bins.
 
     Returns:
-        The bins in ascending order, and the values of each method per bin: number of instances,
-        rates, median rotation error of matched instances (degrees, smallest over the symmetries)
-        and miss rate. The condition of a value is the middle of its bin.
+        The bins in ascending order, and the values of each method per bin, whose condition is the
+        middle of the bin. Rotation errors are the smallest over the symmetries.
     """
     instances = {name: _instances(each, quantity, rates) for name, each in metrics.items()}
     quantities = next(reversed(instances.values()))["quantity"]
@@ -173,10 +166,7 @@ def record_breakdown(
     num_bins: int,
     rates: Sequence[PassRate],
 ) -> None:
-    """Print a table of :func:`break_down` and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``.
-
-    If the test set has no evaluated instance, log a warning instead.
-    """
+    """Print a table of :func:`break_down` and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``."""
     bins, values = break_down(metrics, quantity, num_bins, rates)
     if not bins:
         _log.warning("by=%s: no bins, because the test set has no evaluated instance", quantity)
@@ -205,8 +195,6 @@ def record_breakdown(
 
     rows = pivot(values, ["condition"], cells)
     display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
-    parts = list(metrics.values())[-1].parts
-    display.console.print(radius_note({n: matching_radius(part) for n, part in parts.items()}))
     path = run_dir / f"by_{quantity}"
     write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], csv_cells))
     panels = {

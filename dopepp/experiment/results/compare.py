@@ -7,7 +7,7 @@ predictions of every model on the same test images (paper Fig. 14).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -58,31 +58,18 @@ LOSS_FILE: Final = "compare_loss.png"
 PICTURES_FILE: Final = "compare_pictures.png"
 LOG_FILE: Final = "metrics.csv"
 
-NUM_PICTURES: Final = 3
-"""Number of shown test images: the first images, to avoid a biased selection."""
+NUM_PICTURES: Final = 3  # number of shown test images: the first, for an unbiased selection
 
+# Columns of a log to draw: label, factor, and whether the axis is logarithmic.
 _LOGGED: Final = {
     "train/loss": ("training loss", 1, True),
     "val/loss": ("validation loss", 1, True),
     "val/add_01d": ("validation ADD-0.1d (%)", 100, False),
 }
-"""Columns of a log to draw: label, factor, and whether the axis is logarithmic."""
-
-_MIN_COLUMNS: Final = 3
-"""Minimum number of columns for the tile size; fewer methods would make the tiles too large."""
-_PANEL_PX: Final = 768
-"""Width of a panel if there are no curves."""
-_GAP_PX: Final = 12
-"""Space between tiles."""
-_TOO_WIDE: Final = (
-    "ADD<5cm %",
-    "ADD<10cm %",
-    "Δ rotation °",
-    "rotation-S °",
-    "parameters",
-    "GMACs",
-)
-"""Columns that are omitted in the terminal."""
+# Columns that are omitted in the terminal.
+_TOO_WIDE: Final = frozenset({
+    "ADD<5cm %", "ADD<10cm %", "Δ rotation °", "rotation-S °", "parameters", "GMACs",
+})  # fmt: skip
 
 
 def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:
@@ -134,10 +121,6 @@ def compare_paths(
         baseline: Method that Δ refers to (default: ``dope``, else the first method).
         num_pictures: Number of test images on which every model predicts.
         table: Experiment file in ``conf/experiment``, whose table layout is written in addition.
-
-    Raises:
-        UserError: A path holds no run, the baseline is not among the methods, the experiment has no
-            table, or ``out`` already holds a comparison.
     """
     layout = None if table is None else PaperTable.read(table)
     runs = find_runs(paths)
@@ -161,11 +144,7 @@ def compare_runs(
     """Compare runs, print and write the comparison, and return the methods.
 
     A method that was also measured with refinement counts as two methods. Test images and training
-    curves show the networks without refinement. The table is written first, so the table exists
-    even if drawing curves or images fails.
-
-    Raises:
-        UserError: The baseline is not among the methods.
+    curves show the networks without refinement. The table is written before all images.
     """
     networks = group(runs)
     names = [entry.name for entry in networks]
@@ -176,13 +155,12 @@ def compare_runs(
     entries = with_refined(networks)
     page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
-    shown = num_pictures if any(entry.reports for entry in networks) else 0
-    tiles, missing = image_tiles(networks, shown) if shown else ([], "")
+    tiles, missing = image_tiles(networks, num_pictures)
     if tiles:
         write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
-        width = 2 * max([panel.shape[1] for panel in panels], default=_PANEL_PX)
-        tile_width = width // max(_MIN_COLUMNS, len(networks)) - _GAP_PX
-        sheet = contact_sheet(tiles, len(networks), tile_width)
+        width = 2 * max([panel.shape[1] for panel in panels], default=768)
+        # Fewer than three columns would make the tiles too large; the gap is 12 pixels.
+        sheet = contact_sheet(tiles, len(networks), width // max(3, len(networks)) - 12)
         panels = [*([grid(panels, 2)] if panels else []), sheet]
     if panels:
         write_png(folder / PANELS_FILE, grid(panels, 1 if tiles else 2))
@@ -208,7 +186,16 @@ def _panels(entries: Sequence[Entry], folder: Path) -> list[RGBImage]:
     colours = {entry.name: f"C{number % 10}" for number, entry in enumerate(entries)}
     panels = []
     for column, (label, scale, log_y) in _LOGGED.items():
-        if lines := training_lines(entries, column, colours, scale):
+        lines = []
+        for entry in (entry for entry in entries if not entry.refine):
+            logs = [read_log_column(run.folder / LOG_FILE, column) for run in entry.runs]
+            series = [log for log in logs if log]  # by step; a line has the steps of all seeds
+            steps = sorted(set(series[0]).intersection(*series[1:])) if series else []
+            if steps:
+                values = scale * np.array([[log[step] for step in steps] for log in series])
+                line = (np.array(steps, float), values, colours[entry.name])
+                lines.append(PlotLine(entry.name, *line))
+        if lines:
             panels.append(figure_image(lines_figure(lines, "step", label, log_y)))
     if panels:
         write_png(folder / LOSS_FILE, grid(panels, len(panels)))
@@ -216,31 +203,6 @@ def _panels(entries: Sequence[Entry], folder: Path) -> list[RGBImage]:
         figure = accuracy_figure(curves, title="ADD on test images", colours=colours)
         panels.append(figure_image(figure))
     return panels
-
-
-def training_lines(
-    entries: Sequence[Entry], column: str, colours: Mapping[str, str], scale: float = 1.0
-) -> list[PlotLine]:
-    """Return a line per method for a column of ``metrics.csv``, including unfinished runs.
-
-    Args:
-        entries: Methods.
-        column: Column of the log, such as ``train/loss``.
-        colours: Colour of each method.
-        scale: Factor on the values.
-
-    Returns:
-        Lines over the steps that all seeds of a method have logged.
-    """
-    lines = []
-    for entry in (entry for entry in entries if not entry.refine):
-        logs = [read_log_column(run.folder / LOG_FILE, column) for run in entry.runs]
-        series = [log for log in logs if log]
-        steps = sorted(set(series[0]).intersection(*series[1:])) if series else []
-        if steps:
-            values = scale * np.array([[log[step] for step in steps] for log in series])
-            lines.append(PlotLine(entry.name, np.array(steps, float), values, colours[entry.name]))
-    return lines
 
 
 def read_log_column(path: Path, column: str) -> dict[int, float]:
@@ -252,7 +214,7 @@ def read_log_column(path: Path, column: str) -> dict[int, float]:
     return {step: number for step, number in numbers.items() if math.isfinite(number)}
 
 
-def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
+def image_tiles(entries: Sequence[Entry], num: int) -> tuple[list[Tile], str]:
     """Draw the predictions of all methods on the first ``num`` test images.
 
     The images are from the first method whose test set can be opened. The first seed of each method
@@ -262,7 +224,7 @@ def image_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list
         Tiles row by row (one row per image, one tile per method), and why images are missing.
     """
     measured = [run for entry in entries for run in entry.runs if run.report]
-    kinds = list(dict.fromkeys(map(_parts, measured))) or [()]
+    kinds = list(dict.fromkeys(map(_parts, measured)))[:num]
     tiles, notes = [], []
     for number, parts in enumerate(kinds):
         share = num // len(kinds) + (number < num % len(kinds))
@@ -285,7 +247,7 @@ class _Model:
         self.estimator: PoseEstimator | None = None
         self.run = next((run for run in entry.runs if _parts(run) == parts), entry.runs[0])
         path = self.run.checkpoint
-        if path is None or not path.is_file():
+        if not path.is_file():
             self.reason = entry.failure or f"no file {path}"
             return
         try:
@@ -331,18 +293,17 @@ class _Model:
 
 def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
     """Draw a tile per image and method; return the tiles, and the reason if there are none."""
-    reasons = [f"{model.name}: {model.reason}" for model in models]
     loaded = [model for model in models if model.estimator is not None]
     samples: list[Sample] = []
-    for number, model in enumerate(loaded):
-        reasons = reasons if number else []
+    reasons = [] if loaded else [f"{model.name}: {model.reason}" for model in models]
+    for model in loaded:
         try:
             samples = model.test_images(num)
             break
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        return [], f"Predictions cannot be displayed. {'; '.join(reasons)}" if num else ""
+        return [], f"Predictions cannot be displayed. {'; '.join(reasons)}"
     return [
         model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
         for sample in samples

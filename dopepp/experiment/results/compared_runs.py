@@ -30,51 +30,35 @@ from dopepp.experiment.results.folder import (
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.report import Cost, Report
 
-BASELINE: Final = "dope"
-"""Default name of the baseline: the first method, to which every Δ refers."""
+BASELINE: Final = "dope"  # default name of the baseline: the first method, to which every Δ refers
 
 _HYDRA: Final = ".hydra"
-_TRACES: Final = (_HYDRA, CONFIG_FILE, METRICS_FILE, FAILURE_FILE)
-"""Files and folders, at least one of which every run writes."""
 
+# Options of locations, devices and further measurements, which do not affect the result.
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
-"""Options that state a location or a device and do not affect the result."""
-
 _BESIDE: Final = ("shading", "scale_factors", "by", "num_bins", "bop_csv", "all_measures")
-"""Options that request further measurements and do not affect the result."""
 
+# Options whose default (null) is replaced by a value that suits the sizes of the objects.
 _CHOSEN_SIZES: Final = (("data", "input_size"), ("virtual", "camera_scale"))
-"""Options whose default (null) is replaced by a value that suits the sizes of the objects."""
 
-_LONGEST_NAME: Final = 60
-"""Maximum length of a method's name in tables and legends."""
+_LONGEST_NAME: Final = 60  # maximum length of a method's name in tables and legends
 
 
 @dataclass
 class Run:
-    """A training, evaluation or cost measurement, as read from its run folder.
-
-    Attributes:
-        overrides: Overrides of the run, but not those of locations, devices or Hydra itself.
-        report: Result on the test set, or None.
-        failure: Reason for a missing result; empty if no result was requested (``job=cost``).
-        config: Resolved config; empty if the run has none.
-        recipe: All options that affect the result, except seed and objects, as one string; empty if
-            unknown.
-        pruned: Whether the result is missing because a search stopped the run.
-    """
+    """A training, evaluation or cost measurement, as read from its run folder."""
 
     folder: Path
-    model: str
-    overrides: list[str]
-    report: Report | None
-    failure: str
-    seed: int | None
-    config: dict[str, Any] = field(default_factory=dict)
-    checkpoint: Path | None = None
-    recipe: str = ""
+    overrides: list[str]  # without those of locations, devices or Hydra itself
+    config: dict[str, Any]  # resolved; empty if unknown
+    checkpoint: Path
+    model: str = ""
+    report: Report | None = None
+    failure: str = ""  # reason for a missing result, unless only the cost was requested
+    seed: int | None = None
+    recipe: str = ""  # all options that affect the result, except seed and objects, if known
     cost: Cost | None = None
-    pruned: bool = False
+    pruned: bool = False  # the result is missing because a search stopped the run
 
     @property
     def method_key(self) -> tuple[str, str, str] | None:
@@ -92,24 +76,15 @@ class Run:
 
 @dataclass
 class Entry:
-    """A method in a comparison.
-
-    Attributes:
-        reports: Results on one test set, one per seed.
-        seeds: Seed of each report's training; None if unknown.
-        failure: Reason for a missing result; empty if only the cost was requested.
-        pruned: Whether a search stopped the run, which does not count as a failure.
-        runs: Run folders; empty if the reports were not read from a folder.
-        refine: Kind of refinement; empty for the poses of the network itself.
-    """
+    """A method in a comparison."""
 
     name: str
-    reports: list[Report] = field(default_factory=list)
-    seeds: list[int | None] = field(default_factory=list)
-    failure: str = ""
-    pruned: bool = False
+    reports: list[Report] = field(default_factory=list)  # on one test set, one per seed
+    seeds: list[int | None] = field(default_factory=list)  # None if unknown
+    failure: str = ""  # reason for a missing result, unless only the cost was requested
+    pruned: bool = False  # a search stopped the run, which does not count as a failure
     runs: list[Run] = field(default_factory=list)
-    refine: str = ""
+    refine: str = ""  # empty for the poses of the network itself
 
     @property
     def test_set(self) -> str:
@@ -131,18 +106,15 @@ class Entry:
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
-    """Read the runs in folders of training runs, evaluations and multiruns, each folder once.
-
-    Raises:
-        UserError: A path holds no run.
-    """
+    """Read the runs in folders of training runs, evaluations and multiruns, each folder once."""
     folders = {folder.resolve(): folder for path in paths for folder in _folders(path)}
     return [read_run(folder) for folder in folders.values()]
 
 
 def _folders(path: Path) -> list[Path]:
     """Return the folder itself if it holds a run, or the numbered job folders of a multirun."""
-    if any((path / trace).exists() for trace in _TRACES):
+    traces = (_HYDRA, CONFIG_FILE, METRICS_FILE, FAILURE_FILE)  # every run writes one of these
+    if any((path / trace).exists() for trace in traces):
         return [path]
     jobs = [job for job in path.iterdir() if job.name.isdigit()] if path.is_dir() else []
     if not jobs:
@@ -157,7 +129,7 @@ def _folders(path: Path) -> list[Path]:
 def read_run(folder: Path) -> Run:
     """Read one run folder; ``Run.failure`` states which result is missing or damaged."""
     config = _mapping(folder / CONFIG_FILE)
-    run = Run(folder, "", overrides_of(folder), None, "", None, config, folder / BEST_CHECKPOINT)
+    run = Run(folder, overrides_of(folder), config, folder / BEST_CHECKPOINT)
     try:
         _read_result(run)
     except UserError as error:
@@ -263,9 +235,8 @@ def baseline_first(entries: Sequence[Entry], baseline: str = BASELINE) -> list[E
 def group(runs: Sequence[Run]) -> list[Entry]:
     """Group runs that differ only in the seed into one entry, ordered by their first run.
 
-    The runs must have the same test set. Networks of other parts with the same recipe and seeds
-    join the entry (one network per part, as in the paper). A run without a result forms its own
-    entry.
+    Networks of other parts with the same recipe and seeds join the entry (one network per part, as
+    in the paper). A run without a result forms its own entry.
     """
     entries: list[Entry] = []
     for run in runs:

@@ -1,10 +1,8 @@
 """Measure methods under conditions that make the test set harder or easier: shading and scale.
 
 Shading (paper Table 3) covers an increasing share of every object. Scale (paper Fig. 11) moves the
-camera nearer or farther. Each condition writes a table, a CSV file, curves and examples.
-
-To add a condition, describe it as a :class:`Condition` and write a function that measures a list of
-:class:`Level`. :func:`record_condition` writes the result.
+camera nearer or farther. To add a condition, describe it as a :class:`Condition` and write a
+function that measures a list of :class:`Level`; :func:`record_condition` writes the result.
 """
 
 from __future__ import annotations
@@ -35,13 +33,11 @@ from dopepp.experiment.results.frame import (
     heading,
     markdown,
     pivot,
-    radius_note,
     rate_curves,
     row_values,
     shown_rows,
 )
 from dopepp.experiment.results.measurement import (
-    FileMethod,
     Measured,
     Method,
     accumulators,
@@ -55,70 +51,32 @@ from dopepp.metrics.row import PoseRow
 
 _log = logging.getLogger(__name__)
 
-MAX_EXAMPLES: Final = 4
-"""Maximum number of images on the sheet of examples; each appears once per level."""
+MAX_EXAMPLES: Final = 4  # images on the sheet of examples; each appears once per level
 
+# Measures to report in addition to the pass rates.
 _FIELDS: Final = (
-    "auc_10cm",
-    "median_rotation_deg",
-    "miss_rate",
-    "precision",
-    "false_per_frame",
-    "average_precision",
-    "coverage",
-)
-"""Measures to report in addition to the pass rates."""
-
+    "auc_10cm", "median_rotation_deg", "miss_rate", "precision", "false_per_frame",
+    "average_precision", "coverage",
+)  # fmt: skip
 _LABELS: Final = ("method", "object")
-
-_MARGIN: Final = 0.3
-"""Margin around shaded objects on the sheet of examples, as a share of their extent."""
-
-_NOTABLE: Final = 0.05
-"""Smallest change of the mean visible fraction that a note mentions."""
+_MARGIN: Final = 0.3  # around shaded objects on the sheet of examples, share of their extent
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A quantity that changes from level to level, and how to display its levels.
+    """A quantity that changes from level to level, and how to display its levels."""
 
-    Attributes:
-        name: Name of the option and of the files.
-        axis: Quantity with its unit, for axes and titles.
-        level: Column of the levels in the CSV file.
-        form: Format of a level in the unit of ``axis``.
-        introduction: Beginning of the page.
-        images: Images of the levels, for error messages.
-        per_unit: Factor that converts a level to the unit of ``axis``.
-        ratio: Whether levels are ratios, which need a logarithmic axis.
-    """
-
-    name: str
-    axis: str
-    level: str
-    form: str
-    introduction: str
-    images: str
-    per_unit: float = 1.0
-    ratio: bool = False
+    name: str  # of the option and of the files
+    axis: str  # quantity with its unit, for axes and titles
+    level: str  # column of the levels in the CSV file
+    form: str  # format of a level in the unit of the axis
+    introduction: str  # beginning of the page
+    per_unit: float = 1.0  # converts a level to the unit of the axis
+    ratio: bool = False  # levels are ratios, which need a logarithmic axis
 
     def heading(self, level: float) -> str:
         """Return the column heading of a level, such as ``40 %``."""
         return self.form.format(self.per_unit * level)
-
-    def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Check that all methods are estimators: a file has no poses on the changed images.
-
-        Raises:
-            UserError: A method is a file of poses.
-        """
-        for name, method in methods.items():
-            if isinstance(method, FileMethod):
-                raise UserError(
-                    f"{self.name} with results of {name}, which has no poses on {self.images}",
-                    "checkpoints (ckpt_path, baseline)",
-                    f"leave out {self.name} or results",
-                )
 
 
 SHADING: Final = Condition(
@@ -130,7 +88,6 @@ SHADING: Final = Condition(
 
 Columns: the share of every object's visible pixels that is covered by patches of the image's
 background (paper Table 3). Instances are selected before the shading.""",
-    images="images with patches",
     per_unit=100,
 )
 
@@ -144,26 +101,18 @@ SCALE: Final = Condition(
 Columns: the apparent size of the parts relative to the test set (paper Fig. 11). The camera moves
 along its ray to the parts and divides their distance by this factor; the scenes are unchanged.
 Instances with at least 10 % visible from the moved camera are evaluated.""",
-    images="images of the moved camera",
     ratio=True,
 )
 
 
 @dataclass(frozen=True)
 class Level:
-    """Measurement at one level of a condition, such as 40 % shading.
+    """Measurement at one level of a condition, such as 40 % shading."""
 
-    Attributes:
-        value: Covered share or scale.
-        rows: Rows of all objects and their mean, by method and object.
-        facts: Further columns of the CSV file by heading, measured over all objects.
-        note: Remark for the reader, or an empty string.
-    """
-
-    value: float
-    rows: Mapping[str, Mapping[str, PoseRow]]
-    facts: Mapping[str, float] = field(default_factory=dict)
-    note: str = ""
+    value: float  # covered share or scale
+    rows: Mapping[str, Mapping[str, PoseRow]]  # by method and object, with the mean
+    facts: Mapping[str, float] = field(default_factory=dict)  # further columns of the CSV file
+    note: str = ""  # for the reader
 
 
 def record_condition(
@@ -175,12 +124,7 @@ def record_condition(
 ) -> None:
     """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
 
-    Args:
-        run_dir: Folder for the files.
-        condition: Condition that was measured.
-        levels: Measurements in ascending order of the level.
-        tiles: Examples, image by image, each at all levels.
-        rates: Pass rates to report.
+    Levels are in ascending order; ``tiles`` show examples, image by image, each at all levels.
     """
     rows = [row for rows in levels[0].rows.values() for row in rows.values()]
     extra = ["median_rotation_s_deg"] if any(row.num_symmetries > 1 for row in rows) else []
@@ -202,11 +146,6 @@ def record_condition(
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
-    radii = {row.object: row.matching_radius for row in rows if row.matching_radius}
-    radii.pop(MEAN, None)
-    if radii:
-        notes.append(radius_note(radii))
-        display.console.print(notes[-1])
     path = run_dir / f"{condition.name}.md"
     write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), csv_cells))
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
@@ -241,11 +180,7 @@ def _values(
 
 
 def check_masks(source: SampleSource) -> None:
-    """Check, before anything is measured, that the images have instance masks.
-
-    Raises:
-        UserError: No image has an instance mask.
-    """
+    """Check, before anything is measured, that some image has an instance mask."""
     samples = (source.sample(index) for index in range(len(source)))
     masks = (instance.mask for sample in samples for instance in sample.instances)
     if not any(mask is not None and mask.any() for mask in masks):
@@ -264,18 +199,10 @@ def measure_shading(
     unmasked: Sequence[Report],
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:
-    """Measure every method with shares of the visible area of every instance covered.
+    """Measure every method with ``shares`` of the visible area of every instance covered.
 
-    Instances are selected by the visible fraction before the shading. Otherwise heavily shaded
-    instances would be excluded from the measurement.
-
-    Args:
-        methods: Methods by name.
-        source: Test images.
-        shares: Shares of the visible area to cover, ascending, without 0.
-        seed: Seed of the patches that cover the instances.
-        unmasked: Reports of the methods without shading.
-        num_examples: Number of images on the sheet of examples.
+    Instances are selected by the visible fraction before the shading, because heavily shaded
+    instances would otherwise be excluded. ``unmasked`` are the reports without shading.
 
     Returns:
         The levels, beginning with 0, and the examples, image by image.
@@ -352,11 +279,7 @@ def measure_scales(
 ) -> tuple[list[Level], list[Tile]]:
     """Measure every method at every scale, a factor on the apparent size of the parts.
 
-    Args:
-        methods: Methods by name.
-        sources: Test set by scale, except scale 1.
-        unmoved: Measurement at scale 1.
-        num_examples: Number of images on the sheet of examples.
+    ``sources`` are the test sets by scale, except scale 1, whose measurement is ``unmoved``.
 
     Returns:
         The levels by ascending scale, and the examples, image by image.
@@ -385,7 +308,7 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
     note = (
         f"Evaluated instances at {SCALE.heading(scale)}: {_in_words(visible)}; "
         f"at {SCALE.heading(1)}: {_in_words(reference)}."
-        if len(visible) != len(reference) or abs(mean - reference.mean()) > _NOTABLE
+        if len(visible) != len(reference) or abs(mean - reference.mean()) > 0.05
         else ""
     )
     return Level(scale, rows, {"visible_fraction": mean}, note)
@@ -400,5 +323,4 @@ def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
 def _visible_fractions(measured: Measured) -> Float[np.ndarray, "n"]:
     """Return each instance's visible fraction, from the last method, which has all objects."""
     metrics = next(reversed(measured.metrics.values()))
-    gathered = [metrics.instances(name).visible_fractions for name in metrics.parts]
-    return np.concatenate([fractions.numpy() for fractions in gathered])
+    return np.concatenate([metrics.instances(part).visible_fractions for part in metrics.parts])

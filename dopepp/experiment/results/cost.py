@@ -10,13 +10,12 @@ image plus the noise of a trained network (:data:`BELIEF_NOISE`).
 from __future__ import annotations
 
 import platform
-import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -35,12 +34,11 @@ from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
 from dopepp.experiment.results.pages import write_run_readme
-from dopepp.experiment.results.report import Cost
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator
 from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps.codec import MapGeometry
-from dopepp.models.network import build_network, network_cost
+from dopepp.models.network import network_cost
 from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
@@ -57,41 +55,26 @@ FIELD_NOISE: Final = 0.05
 """Standard deviation per cell of the noise on the true maps. With this noise, recovery takes about
 as long as on the maps of trained networks (``benchmarks/decode.py``)."""
 
-WARM_UP: Final = 3
-"""Number of untimed passes, which allocate memory, select kernels and compile."""
-
-_NUM_IMAGES: Final = 8
-_BATCHES: Final = 3
+WARM_UP: Final = 3  # number of untimed passes, which allocate memory, select kernels and compile
 
 
 @dataclass(frozen=True)
 class NetworkCost:
-    """Cost of a network on this machine; sizes are (width, height) in pixels.
-
-    Attributes:
-        backbone_weights: Weights of the backbone's convolutions without biases, as in the paper.
-        gmacs: Multiply-accumulates for one image of the input size, 10⁹.
-        picture_size: Size of the timed images before they are scaled to the input size.
-        threads: Number of CPU threads.
-        ms_per_frame: Median time from an image to its poses, milliseconds.
-        network_ms: Median time of the network within a frame, milliseconds.
-        recovery_ms: Median time of the recovery (maps to poses) within a frame, milliseconds.
-        frames_per_s: Throughput of the network alone in batches of ``batch_size``, fastest batch.
-    """
+    """Cost of a network on this machine; sizes are (width, height), pixels; times are medians."""
 
     name: str
-    backbone_weights: int
+    backbone_weights: int  # of the convolutions, without biases, as in the paper
     parameters: int
-    gmacs: float
+    gmacs: float  # 10⁹ multiply-accumulates for one image of the input size
     input_size: tuple[int, int]
-    picture_size: tuple[int, int]
+    picture_size: tuple[int, int]  # of the timed images, before scaling
     device: str
-    threads: int
-    ms_per_frame: float
-    network_ms: float
-    recovery_ms: float
+    threads: int  # of the CPU
+    ms_per_frame: float  # from an image to its poses
+    network_ms: float  # part of `ms_per_frame`
+    recovery_ms: float  # part of `ms_per_frame`, from maps to poses
     batch_size: int
-    frames_per_s: float
+    frames_per_s: float  # of the network alone, in its fastest batch
 
     def texts(self) -> dict[str, str]:
         """Return sizes, counts and times as texts for tables, by heading."""
@@ -111,16 +94,10 @@ class NetworkCost:
 
 
 class SimulatedMapsEstimator(PoseEstimator):
-    """Estimator that runs its network but recovers poses from the maps in ``answer``.
+    """Estimator that runs its network but recovers poses from the maps in ``answer``."""
 
-    Attributes:
-        answer: Maps for the next prediction, on the device of the estimator.
-        network_began: Start of the last network pass, in seconds of ``perf_counter``.
-        network_ended: End of the last network pass.
-    """
-
-    answer: Maps
-    network_began: float
+    answer: Maps  # for the next prediction, on the device of the estimator
+    network_began: float  # of the last pass, in seconds of `perf_counter`
     network_ended: float
 
     def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
@@ -143,7 +120,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     parameters, gmacs = network_cost(network, description.input_size)
     source = held_out_source(config.data, parts, "test")
     # Images are prepared first so that frame times exclude reading and rendering.
-    samples = [source.sample(index) for index in range(min(_NUM_IMAGES, len(source)))]
+    samples = [source.sample(index) for index in range(min(8, len(source)))]
     estimator = SimulatedMapsEstimator(network, description, "cuda" if has_gpu else "cpu")
     geometry = MapGeometry(network.stride, config.maps.sigma, config.maps.field_radius)
     frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
@@ -186,12 +163,7 @@ def time_frames(
 ) -> pd.DataFrame:
     """Time frames from image to poses, after :data:`WARM_UP` untimed frames.
 
-    Args:
-        estimator: Estimator to time.
-        samples: Images, which are used in turn.
-        geometry: Geometry of the simulated maps.
-        num_frames: Number of timed frames.
-        seed: Seed of the noise on the maps.
+    ``samples`` are used in turn; ``seed`` is that of the noise on the simulated maps.
 
     Returns:
         Per frame, the ``seconds`` from image to poses, of which ``network_seconds`` for the
@@ -213,10 +185,7 @@ def time_frames(
 def likely_maps(
     sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
 ) -> Maps:
-    """Simulate the maps of a trained network: maps drawn from the true poses, with noise.
-
-    The maps are for an image at the estimator's input size, and on its device.
-    """
+    """Simulate a trained network's maps of an image: the true poses' maps, with noise."""
     size = estimator.checkpoint.input_size
     letterbox = Letterbox.fit(sample.size, size)
     rows, columns, _ = resize_and_pad(
@@ -248,30 +217,6 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames per second")))
 
 
-def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
-    """Return the cost of the untrained network of a spec, widened to ``width`` 1.
-
-    The time is the median of three forward passes on the CPU after an untimed pass.
-
-    Args:
-        spec: Description of the network for :func:`~dopepp.models.network.build_network`.
-        input_size: Input size (width, height), pixels; the paper uses 416×416.
-    """
-    widened = {
-        key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
-        for key, node in spec.items()
-    }
-    network = build_network(widened).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
-    times = []
-    with torch.inference_mode():
-        for _ in range(4):
-            start = time.perf_counter()
-            network.maps(images)
-            times.append(1000 * (time.perf_counter() - start))
-    return Cost(*network_cost(network, input_size), statistics.median(times[1:]))
-
-
 @torch.inference_mode()
 def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, int]) -> float:
     """Return the network's frames per second in its fastest pass over random images."""
@@ -280,7 +225,7 @@ def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, in
     images = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
     images = images.contiguous(memory_format=torch.channels_last)
     times = []
-    for _ in range(WARM_UP + _BATCHES):
+    for _ in range(WARM_UP + 3):
         start = time.perf_counter()
         estimator.network.maps(images)
         if device.type == "cuda":

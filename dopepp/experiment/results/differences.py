@@ -15,7 +15,6 @@ from jaxtyping import Float
 
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.frame import (
-    BEYOND,
     COST_FORMS,
     DELTA,
     FIELDS,
@@ -26,11 +25,10 @@ from dopepp.experiment.results.frame import (
     make_frame,
     means,
     pivot,
-    radius_note,
     row_values,
     values_of,
 )
-from dopepp.experiment.results.report import FULL_SIZE_COST, Cost, Report
+from dopepp.experiment.results.report import Report
 from dopepp.metrics.bootstrap import StatisticName, paired_difference
 from dopepp.metrics.pose import MEAN
 
@@ -38,33 +36,25 @@ REFINED_NOTE: Final = (
     "Δ of refined poses is against the first refined row, whose own Δ is against the first row."
 )
 
+# Measures of the compact table; the full table shows all measures and all Δ.
 _HEADLINE: Final = frozenset({
     "", "add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg", "miss_rate",
     "precision", "false_per_frame", "average_precision", "coverage",
     f"{DELTA}add_01d", f"{DELTA}auc_10cm", f"{DELTA}median_rotation_deg", *COST_FORMS,
 })  # fmt: skip
-"""Measures of the compact table; the full table shows all measures and all Δ."""
-
 _SYMMETRIC: Final = frozenset({"add_or_s_01d", "median_rotation_s_deg"})
-"""Measures that the compact table adds for objects with symmetries."""
 
-Counted = Callable[[Report, str], Float[np.ndarray, "instances"]]
-"""Function from a report and an object's name to the score of every instance."""
+# Score of every instance of an object, from a report and the object's name.
+Scores = Callable[[Report, str], Float[np.ndarray, "instances"]]
 
-
-def _passes(threshold: float) -> Counted:
-    """Return a function that scores an instance 1 if its ADD is below ``threshold`` (m), else 0."""
-    return lambda report, name: (report.errors[name] < threshold).astype(np.float64)
-
-
-COMPARED: Final[dict[str, tuple[Counted, StatisticName]]] = {
-    "add_01d": (lambda report, name: _passes(0.1 * report.diameters[name])(report, name), "mean"),
-    "pass_5cm": (_passes(0.05), "mean"),
-    "pass_10cm": (_passes(0.1), "mean"),
+COMPARED: Final[dict[str, tuple[Scores, StatisticName]]] = {
+    "add_01d": (lambda report, name: report.errors[name] < 0.1 * report.diameters[name], "mean"),
+    "pass_5cm": (lambda report, name: report.errors[name] < 0.05, "mean"),
+    "pass_10cm": (lambda report, name: report.errors[name] < 0.1, "mean"),
     "auc_10cm": (lambda report, name: np.clip(1 - report.errors[name] / 0.1, 0, 1), "mean"),
     "median_rotation_deg": (lambda report, name: report.rotation_deg[name], "median"),
 }
-"""Measures with a Δ, by their field of ``PoseRow``: instance score and its statistic."""
+"""Measures with a Δ, by their field of ``PoseRow``: score of the instances and its statistic."""
 
 
 def comparable(entry: Entry, baseline: Entry) -> bool:
@@ -75,8 +65,7 @@ def comparable(entry: Entry, baseline: Entry) -> bool:
 def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Value]:
     """Return Δ of a method to a baseline on an object or ``mean``, by field of ``PoseRow``.
 
-    The bootstrap samples seeds in pairs if both methods have the same seeds. For methods that
-    cannot be compared, ``num_differing`` is NaN.
+    The bootstrap samples seeds in pairs if both methods have the same seeds.
     """
     values = {field: Value(entry.name, name, f"{DELTA}{field}") for field in COMPARED}
     objects = _scored(entry, name)
@@ -88,9 +77,9 @@ def differences(entry: Entry, baseline: Entry | None, name: str) -> dict[str, Va
     same = len(first) == len(second) == 1 or (
         not unknown and sorted(map(str, entry.seeds)) == sorted(map(str, baseline.seeds))
     )
-    for field, (counted, statistic) in COMPARED.items() if objects else ():
+    for field, (score, statistic) in COMPARED.items() if objects else ():
         scores, baseline_scores = (
-            [np.stack([counted(report, part) for report in method]) for part in objects]
+            [np.stack([score(report, part) for report in method]).astype(float) for part in objects]
             for method in (first, second)
         )
         change = paired_difference(scores, baseline_scores, statistic, same_seeds=same)
@@ -123,8 +112,8 @@ def _by_seed(entry: Entry) -> list[Report]:
 def comparison_frame(entries: Sequence[Entry]) -> pd.DataFrame:
     """Build the results table of a comparison: means over seeds, ordered by method and object.
 
-    The baseline is the first entry with a result (see :func:`_baseline_of`). The reference rows of
-    its test set come last. A method without a result has one row, whose object states the reason.
+    The reference rows of the baseline's test set come last. A method without a result has one row,
+    whose object states the reason.
     """
     return means(make_frame(_values(entries)))
 
@@ -159,23 +148,13 @@ def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 
 
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
-    """Yield the cost of a method and, for a narrowed network, the cost at full width."""
-    costs = {"": entry.cost}
-    if entry.reports and (full_size := entry.reports[0].details.get(FULL_SIZE_COST)) is not None:
-        costs["full-size "] = Cost(**full_size)
-    for prefix, cost in costs.items():
-        for measure, value in zip(COST_FORMS, vars(cost).values(), strict=True):
-            number = math.nan if value is None else float(value)
-            yield Value(entry.name, name, f"{prefix}{measure}", number)
+    """Yield the cost of a method."""
+    for measure, value in zip(COST_FORMS, vars(entry.cost).values(), strict=True):
+        yield Value(entry.name, name, measure, math.nan if value is None else float(value))
 
 
 def compact_table(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
-    """Return the main measures, with ``value ± deviation`` and ``Δ [interval]`` as cells.
-
-    Args:
-        table: Result of :func:`comparison_frame`.
-        symmetric: Whether any object has symmetries.
-    """
+    """Return the main measures of a comparison, with ``value ± deviation`` and ``Δ [interval]``."""
     chosen = _HEADLINE | _SYMMETRIC if symmetric else _HEADLINE
     several = _has_seeds(table)
 
@@ -194,7 +173,7 @@ def full_table(table: pd.DataFrame) -> list[Row]:
         if value.measure:
             row[title] = value.text
         if value.is_change:
-            verdict = WITHIN if value.within_noise else BEYOND
+            verdict = WITHIN if value.within_noise else "beyond noise"
             texts = [*value.ends, verdict] if value.ends else [value.text] * 3
             row |= zip((f"{title} {end}" for end in ("low", "high", "verdict")), texts, strict=True)
         elif several and value.measure in FIELDS:
@@ -220,8 +199,6 @@ def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
     """Return sentences that explain the table: baseline, intervals, noise and narrowed networks."""
     sentences: list[str] = []
     measured = [entry for entry in entries if entry.reports]
-    if measured and (radii := measured[0].reports[0].matching_radii):
-        sentences.append(radius_note(radii))
     networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
         sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(table))

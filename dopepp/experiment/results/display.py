@@ -52,9 +52,7 @@ def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:
 def show_report(report: Report, all_measures: bool = False) -> None:
     """Print a table per object: measures as rows; method, refined poses, references as columns.
 
-    Args:
-        report: Result to print.
-        all_measures: Whether to show the symmetric measures of parts without symmetries.
+    ``all_measures`` adds the symmetric measures of parts without symmetries.
     """
     for name, (row, *references) in report.tables.items():
         if row.num_instances == 0:
@@ -75,13 +73,7 @@ def show_report(report: Report, all_measures: bool = False) -> None:
 
 
 def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 1) -> None:
-    """Print rows as a table; missing cells are empty.
-
-    Args:
-        title: Title of the table.
-        rows: Texts by heading.
-        num_labels: Number of left-aligned text columns; the remaining columns are right-aligned.
-    """
+    """Print rows as a table whose first ``num_labels`` columns are texts."""
     table = Table(title=title)
     header = header_of(rows)
     for number, heading in enumerate(header):

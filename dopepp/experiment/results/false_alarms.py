@@ -26,29 +26,19 @@ from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 TITLE: Final = "Images without the part"
-KEY: Final = "without_part"
-"""Key of ``Report.details``: a :class:`FalseAlarms` as a dictionary."""
+KEY: Final = "without_part"  # key of `Report.details`: a `FalseAlarms` as a dictionary
 
-NUM_LOUDEST: Final = 6
-"""Number of images with the highest scores to name and to draw."""
+NUM_LOUDEST: Final = 6  # number of images with the highest scores to name and to draw
 
 
 @dataclass(frozen=True)
 class FalseAlarms:
-    """Detections of an estimator on images without its parts.
-
-    Attributes:
-        num_pictures: Number of images.
-        per_picture: Reported detections per image.
-        threshold: Minimum score of a reported detection.
-        loudest: Highest score of a candidate by image, for the images with the highest scores,
-            in descending order. Scores below the threshold count as well.
-    """
+    """Detections of an estimator on images without its parts."""
 
     num_pictures: int
-    per_picture: float
-    threshold: float
-    loudest: dict[str, float]
+    per_picture: float  # reported detections
+    threshold: float  # minimum score of a reported detection
+    loudest: dict[str, float]  # images with the highest scores of candidates, descending
 
     def row(self, method: str) -> Row:
         """Return the texts of a method's table row, by heading."""
@@ -84,17 +74,9 @@ class UndistortedFrames:
 def frames_without_parts(
     folder: Path, camera: Path | None, data: DataConfig, parts: Parts
 ) -> UndistortedFrames:
-    """Open a folder of images that show none of the parts.
+    """Open a folder of photos, searched recursively, that show none of the parts.
 
-    Args:
-        folder: Folder of photos, searched recursively.
-        camera: Camera file; None for the camera of the data. Images are scaled and cropped to
-            the camera's size.
-        data: Config of the test data.
-        parts: Parts of the estimators.
-
-    Raises:
-        UserError: The folder has no photos, or the camera file cannot be read.
+    Images are scaled and cropped to ``camera``, or to the camera of the test data.
     """
     images = PhotoBackgrounds(folder)
     if camera is None:
@@ -114,9 +96,7 @@ def count_false_alarms(
 ) -> tuple[dict[str, FalseAlarms], list[Tile]]:
     """Count the detections of estimators on images without their parts.
 
-    Returns:
-        The counts by estimator, and tiles of the last estimator's images with the highest
-        scores, with their best candidate.
+    Also return tiles of the last estimator's images with the highest scores.
     """
     alarms, tiles = {}, []
     for name, estimator in estimators.items():
@@ -132,15 +112,12 @@ def count_false_alarms(
         scores = {sample.key: score for sample, score in loudest}
         rate = num_reported / len(frames)
         alarms[name] = FalseAlarms(len(frames), rate, estimator.min_score, scores)
-        tiles = [_tile(estimator, sample) for sample, _ in loudest]
+        tiles = []
+        for sample, score in loudest:
+            best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
+            wireframe = Wireframe(best.keypoints, YELLOW, f"{best.object} {score:.3g}")
+            tiles.append(Tile(overlay(sample.image, [wireframe]), sample.key))
     return alarms, tiles
-
-
-def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
-    """Draw the candidate with the highest score on an image without the part."""
-    best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
-    label = f"{best.object} {best.score:.3g}"
-    return Tile(overlay(sample.image, [Wireframe(best.keypoints, YELLOW, label)]), sample.key)
 
 
 def alarm_rows(report: Report) -> list[Row]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -34,15 +33,11 @@ PRUNED_FILE: Final = "pruned.json"
 OBJECTIVE: Final = "objective"
 """Key of ``metrics.json``: validation value by which the best checkpoint was selected."""
 OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
+# Files of a run folder that are written before the work begins.
 OF_THE_START: Final = frozenset({".hydra", CONFIG_FILE, VERSIONS_FILE, "README.md"})
-"""Files of a run folder that are written before the work begins."""
-DIFFERENCE: Final = "working_tree_"
-"""Prefix of the file with the uncommitted changes of the working tree."""
 BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
 LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
-_MAX_DIFF_BYTES: Final = 10_000_000
-"""Maximum size of stored uncommitted changes; of larger changes, only the hash is stored."""
 _MAX_UNTRACKED: Final = 100
 
 
@@ -58,20 +53,14 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON record of a run folder.
-
-    Raises:
-        UserError: The file is missing or is not a JSON object.
-    """
+    """Read a JSON object of a run folder."""
+    allowed, fix = "a JSON object written by a run", "run the training or the evaluation again"
     try:
         record = read_strict_json(path)
     except UserError as error:
-        allowed = "a file written by a run"
-        fix = "run the training or the evaluation again"
         raise UserError(f"{error.got}, which cannot be read", allowed, fix) from error
     if not isinstance(record, dict):
-        fix = "run the training or the evaluation again"
-        raise UserError(f"{path}, which contains a {type(record).__name__}", "a JSON object", fix)
+        raise UserError(f"{path}, which contains a {type(record).__name__}", allowed, fix)
     return record
 
 
@@ -80,32 +69,22 @@ def write_environment(
 ) -> None:
     """Write the :func:`environment` of a run to ``versions.json``, and keep earlier entries.
 
-    Args:
-        run_dir: Run folder.
-        seed: Seed of the run.
-        data_fingerprint: Hash of the data; empty if unknown.
-        changes: Changes of the config since the run began or was last resumed.
+    ``changes`` are those of the config since the run began or was last resumed.
     """
     path = run_dir / VERSIONS_FILE
     earlier: list[object] = []
     if path.is_file():
         latest = read_json(path)
-        previous = latest.pop("earlier", [])
-        earlier = [*(previous if isinstance(previous, list) else []), latest]
+        earlier = [*latest.pop("earlier", []), latest]
     present = environment(seed, data_fingerprint)
-    diff = _git("diff", "--binary", "HEAD")
-    if present["git"] is not None and diff:
-        digest = hashlib.sha256(diff).hexdigest()
-        present["git"]["diff_sha256"] = digest
-        if len(diff) <= _MAX_DIFF_BYTES:
-            present["git"]["diff"] = f"{DIFFERENCE}{digest[:8]}.diff"
-            write_file(run_dir / present["git"]["diff"], diff)
     write_json(path, {**present, "changes": list(changes), "earlier": earlier})
 
 
 def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
     """Return time, command, versions, git state, hardware, seed and data hash as JSON values."""
     gpus = map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
+    is_posix = hasattr(os, "sysconf")
+    memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if is_posix else None
     return {
         "dopepp": dopepp.__version__,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -117,7 +96,7 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
             "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
-            "memory_bytes": _memory_bytes(),
+            "memory_bytes": memory_bytes,
             "gpus": [{"name": gpu.name, "memory_bytes": gpu.total_memory} for gpu in gpus],
             "cuda": torch.version.cuda,
         },
@@ -134,14 +113,6 @@ def _packages() -> dict[str, str]:
     headers = (package.metadata for package in distributions())  # parsed at every access
     versions = [(header["Name"], header["Version"]) for header in headers if "Name" in header]
     return dict(sorted(versions, key=lambda version: version[0].lower()))
-
-
-def _memory_bytes() -> int | None:
-    """Return the size of the machine's memory, or None if the system does not report it."""
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError):
-        return None
 
 
 def _git(*arguments: str) -> bytes | None:

@@ -1,11 +1,9 @@
 """The results frame: one long pandas table of all measured values; other tables are views of it.
 
 A row of the frame is a :class:`Value`. :func:`means` averages the frame over seeds, and
-:func:`pivot` arranges the values as a table. :func:`markdown`,
-:func:`~dopepp.core.files.write_csv` and :func:`~dopepp.experiment.results.display.show_table` write
-the table. The module also defines the pass rates that all protocols report.
-
-To add a rate, define it below :class:`PassRate`. A rate needs a field in ``PoseRow``.
+:func:`pivot` arranges the values as a table, which :func:`markdown`,
+:func:`~dopepp.core.files.write_csv` or :func:`~dopepp.experiment.results.display.show_table` write.
+The module also defines the pass rates that all protocols report (:class:`PassRate`).
 """
 
 from __future__ import annotations
@@ -28,65 +26,37 @@ from dopepp.metrics.pose import MEAN, EvaluatedInstances
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow, symmetry_transforms
 from dopepp.parts.part import Parts
 
-Row = dict[str, str]
-"""Texts of a table row by column heading."""
+Row = dict[str, str]  # texts of a table row by column heading
 
-DELTA: Final = "Δ "
-"""Prefix of measures that are differences to the baseline."""
+DELTA: Final = "Δ "  # prefix of measures that are differences to the baseline
 
 COST_FORMS: Final = {"parameters": ",.0f", "GMACs": ".3f", "ms/frame": ".1f"}
-"""Format of each cost measure."""
-
 FIELDS: Final = {column.field: column for column in COLUMNS}
-"""Columns of the pose measures by their field of ``PoseRow``."""
-
-NOMINAL: Final = np.linspace(0.05, 0.95, 19)
-"""Nominal probabilities of the covariance regions whose coverage is measured."""
-
+NOMINAL: Final = np.linspace(0.05, 0.95, 19)  # probabilities of the measured covariance regions
 WITHIN: Final = "within noise"
-BEYOND: Final = "beyond noise"
+MIN_DIFFERING: Final = fewest_differing(0.95)  # instances, for a significant difference
 
-MIN_DIFFERING: Final = fewest_differing(0.95)
-"""Minimum number of differing instances for a significant difference."""
-
+# Headings of text columns.
 _TEXTS: Final = ("method", "object", "measure", "overrides", "folder", "job", "state")
-"""Headings of text columns."""
 
 Cell = TypeVar("Cell")
 
 
 class Value(NamedTuple):
-    """A measured value, a row of the results table; missing numbers are NaN.
+    """A measured value, a row of the results table; missing numbers are NaN."""
 
-    Attributes:
-        method: Name of the method or of the reference.
-        object: Name of the part, ``mean``, or the reason for a missing result.
-        measure: Field of ``PoseRow``, with :data:`DELTA` before it for a difference to the
-            baseline, or a heading; empty for a method without values.
-        value: Value in the field's unit.
-        seed: Seed of the training, or None if unknown.
-        condition: Level of a condition, or the middle of a bin.
-        low: Lower end of the 95 % interval.
-        high: Upper end.
-        num_differing: For a difference, number of instances on which the methods differ; NaN if
-            the methods cannot be compared.
-        seeds_needed: For a difference, approximate number of seeds for significance.
-        deviation: For a mean, sample standard deviation over the seeds.
-        seeds: Seeds of the method on the object.
-    """
-
-    method: str
-    object: str
-    measure: str = ""
-    value: float = math.nan
-    seed: int | None = None
-    condition: float = 0.0
-    low: float = math.nan
+    method: str  # or a reference
+    object: str  # name of the part, `mean`, or the reason for a missing result
+    measure: str = ""  # field of `PoseRow`, `DELTA` and a field, a heading, or empty
+    value: float = math.nan  # in the field's unit
+    seed: int | None = None  # of the training; None if unknown
+    condition: float = 0.0  # level of a condition, or the middle of a bin
+    low: float = math.nan  # ends of the 95 % interval
     high: float = math.nan
-    num_differing: float = math.nan
-    seeds_needed: float = math.nan
-    deviation: float = math.nan
-    seeds: tuple[int, ...] = ()
+    num_differing: float = math.nan  # instances on which the compared methods differ
+    seeds_needed: float = math.nan  # approximate number of seeds for a significant difference
+    deviation: float = math.nan  # sample standard deviation over the seeds
+    seeds: tuple[int, ...] = ()  # of the method on the object
 
     @property
     def names(self) -> Row:
@@ -100,10 +70,7 @@ class Value(NamedTuple):
 
     @property
     def within_noise(self) -> bool:
-        """Whether a difference to the baseline is not significant.
-
-        Too few instances differ, or the 95 % interval contains 0.
-        """
+        """Whether too few instances differ, or the interval of a difference contains 0."""
         return self.num_differing < MIN_DIFFERING or self.low <= 0 <= self.high
 
     @property
@@ -120,7 +87,7 @@ class Value(NamedTuple):
     @property
     def text(self) -> str:
         """Text for tables: ``n/a`` for a missing value, empty for a Δ that is undefined."""
-        form = COST_FORMS.get(self.measure.removeprefix("full-size "))
+        form = COST_FORMS.get(self.measure)
         if not self.measure or (self.is_change and math.isnan(self.num_differing)):
             return ""
         if form is not None:
@@ -197,8 +164,7 @@ def interval(rate: float, num: int) -> tuple[float, float]:
 def means(frame: pd.DataFrame) -> pd.DataFrame:
     """Average a results table over seeds: one row per method, object, measure and condition.
 
-    The mean is NaN if the value of any seed is missing, because a mean over the remaining seeds
-    would be biased.
+    The mean is NaN if the value of any seed is missing; a mean over the others would be biased.
     """
     groups = frame.groupby(["method", "object", "measure", "condition"], sort=False)
     complete = groups["value"].count() == groups.size()
@@ -241,12 +207,6 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def radius_note(radii: Mapping[str, float]) -> str:
-    """Return a sentence with the matching radius of each object, given in metres by name."""
-    listed = ", ".join(f"{name} {1000 * radius:.0f} mm" for name, radius in radii.items())
-    return f"Matching radius, half a diameter and at most 10 cm: {listed}."
-
-
 def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, RateCurve]:
     """Return a curve for each method: the rate against the condition multiplied by ``per_unit``."""
     points: dict[str, list[tuple[float, ...]]] = {}
@@ -260,7 +220,7 @@ def rate_curves(rates: Iterable[Value], per_unit: float = 1.0) -> dict[str, Rate
 def coverage_curve(instances: EvaluatedInstances) -> RateCurve | None:
     """Return the observed against the nominal coverage of an object's covariance regions.
 
-    The curve covers matched poses with a covariance; None without any.
+    None without a matched pose that has a covariance.
     """
     distances = instances.errors.mahalanobis
     stated = None if distances is None else distances[distances.isfinite()]
@@ -278,18 +238,11 @@ def shown_rows(rows: Mapping[str, PoseRow]) -> dict[str, PoseRow]:
 
 @dataclass(frozen=True)
 class PassRate:
-    """Share of instances whose error is below a threshold.
+    """Share of instances whose error is below a threshold."""
 
-    Attributes:
-        field: Field of :class:`~dopepp.metrics.row.PoseRow` with this rate.
-        error: Error that is compared with the threshold.
-        threshold: Threshold in diameters if ``relative``, else in metres.
-        relative: Whether the threshold scales with the diameter of the object.
-    """
-
-    field: str
+    field: str  # of `PoseRow`
     error: Literal["add", "mssd"]
-    threshold: float
+    threshold: float  # in diameters if relative, else in metres
     relative: bool = True
 
     @property
@@ -311,11 +264,7 @@ MSSD_01D: Final = PassRate("mssd_01d", "mssd", 0.1)
 
 
 def reported_rates(data: DataConfig, parts: Parts) -> tuple[PassRate, ...]:
-    """Return the pass rates to report for a data set.
-
-    The rates are the paper's rate (ADD below 0.1 m on YCB-Video, below 0.05 m elsewhere), ADD-0.1d
-    and, if a part has symmetries, MSSD-0.1d.
-    """
+    """Return the paper's pass rate (0.1 m on YCB-Video, else 0.05 m) and the strict rates."""
     is_ycb = data.root is not None and data.format == "ycb_video"
     rates = (ADD_10CM if is_ycb else ADD_5CM), ADD_01D
     symmetric = any(len(symmetry_transforms(part)) > 1 for part in parts)

@@ -34,7 +34,6 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import ExportedNetwork
 from dopepp.metrics.localisation import BopScores, Draw, Localisation
 from dopepp.metrics.pose import PoseMetrics, PredictedPose
-from dopepp.metrics.row import PoseRow
 from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery.recover import Reason, main_reasons
@@ -44,11 +43,9 @@ from dopepp.virtual.surface import Surface, make_surface
 
 _log = logging.getLogger(__name__)
 
-ImageId = tuple[int, int]
-"""BOP's scene_id and im_id."""
+ImageId = tuple[int, int]  # BOP's scene_id and im_id
 
-_WARM_UP_FRAMES: Final = 3
-"""Number of untimed first frames, which allocate memory and select kernels."""
+_WARM_UP_FRAMES: Final = 3  # untimed, because they allocate memory and select kernels
 
 _BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
 _NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
@@ -63,15 +60,10 @@ class ScoredPose(PredictedPose, Protocol):
 
 
 class Method(Protocol):
-    """Source of poses for the images of a test set.
+    """Source of poses for the images of a test set."""
 
-    Attributes:
-        parts: Objects to measure, as defined by the test set.
-        min_score: Smallest score of a reported candidate.
-    """
-
-    parts: Parts
-    min_score: float
+    parts: Parts  # objects to measure, as defined by the test set
+    min_score: float  # smallest score of a reported candidate
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Return all candidates in an image, and the time in seconds, or None if unknown."""
@@ -102,11 +94,6 @@ class EstimatorMethod:
         )
         seconds = time.perf_counter() - start
         return [candidate for candidate in candidates if candidate.object in self._names], seconds
-
-    @property
-    def takes_views(self) -> bool:
-        """Whether the estimator accepts several views: its refinement verifies poses."""
-        return self.estimator.refiner is not None and self.estimator.refiner.verifies
 
     def rejection(self, sample: Sample) -> Reason | None:
         """Return why the best candidate in an image without detections was rejected, if any."""
@@ -166,15 +153,10 @@ class FilePose:
 
 
 class FileMethod:
-    """Poses of another program, read from a BOP challenge CSV.
+    """Poses of another program, read from a BOP challenge CSV with BOP's ``numbers`` of objects.
 
     Poses of other objects than ``parts`` are ignored. All poses with a score of at least 0 count
     as detections.
-
-    Args:
-        path: CSV file.
-        parts: Objects to measure.
-        numbers: BOP's ``obj_id`` of each object, by name.
     """
 
     min_score = 0.0
@@ -191,11 +173,11 @@ class FileMethod:
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[ScoredPose], float | None]:
         """Return an image's poses, and the largest time of its lines in seconds or None."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
-        poses = [
-            FilePose(part.name, row.score, T, project_keypoints(part.cuboid, T, sample.K))
-            for row, T in ((row, row.T_cam_obj) for row in rows)
-            if (part := self._parts.get(row.obj_id)) is not None
-        ]
+        poses = []
+        for row in rows:
+            if (part := self._parts.get(row.obj_id)) is not None:
+                keypoints = project_keypoints(part.cuboid, row.T_cam_obj, sample.K)
+                poses.append(FilePose(part.name, row.score, row.T_cam_obj, keypoints))
         seconds = max((row.seconds for row in rows), default=-1.0)
         return poses, seconds if seconds >= 0 else None
 
@@ -204,11 +186,7 @@ class FileMethod:
         return Cost(ms_per_frame=_median_ms(seconds))
 
     def check_used(self) -> None:
-        """Log, after all images, how many poses are on other images or of other objects.
-
-        Raises:
-            UserError: No pose was on an image of the test set.
-        """
+        """Check, after all images, that poses were used; log how many were not."""
         used = [row for rows in self._used.values() for row in rows]
         unused = [row for rows in self._unused.values() for row in rows]
         if unused and not used:
@@ -221,19 +199,15 @@ class FileMethod:
         others = sum(row.obj_id not in self._parts for row in used)
         if unused or others:
             _log.warning(
-                "%s: ignoring %s poses on images outside the test set and %s poses of other "
-                "objects",
-                self._path,
-                f"{len(unused):,}",
-                f"{others:,}",
+                f"{self._path}: ignoring {len(unused):,} poses on images outside the test set and "
+                f"{others:,} poses of other objects"
             )
 
 
 def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
     """Return BOP's ``obj_id`` of each object, by name.
 
-    Numbers come from ``models_info.json`` for BOP data sets and from the line numbers of
-    ``classes.txt`` for YCB-Video. Otherwise parts are numbered from 1.
+    Parts of other data sets than BOP and YCB-Video are numbered from 1.
     """
     root = data.root
     if root is not None and data.format in ("bop", "webdataset"):
@@ -245,10 +219,9 @@ def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
 
 
 def image_id(sample: Sample, index: int) -> ImageId:
-    """Return the BOP scene and image number of an image.
+    """Return the BOP scene and image number of an image, from its key, such as ``000001/000017``.
 
-    The numbers come from the key (such as ``000001/000017``) in BOP data sets and YCB-Video.
-    Other data sets have scene 0, and the image number is the index in the test set.
+    Data sets other than BOP and YCB-Video have scene 0 and the index in the test set.
     """
     match = _BOP_KEY.fullmatch(sample.key)
     if match is None or sample.source.partition("/")[0] not in _NUMBERED_SOURCES:
@@ -263,24 +236,14 @@ def _median_ms(seconds: Sequence[float]) -> float | None:
 
 @dataclass
 class Measured:
-    """Result of measuring methods on a test set.
-
-    Attributes:
-        reports: One report per method.
-        tiles: Drawings of the first images.
-        poses: Candidates of each method, each with its image and the seconds for this image, or
-            None if unknown.
-        metrics: Accumulator of each method.
-        silent: Indices of images with instances in which a method detected nothing.
-        bop: BOP scores of each method, if requested and the images have targets.
-    """
+    """Result of measuring methods on a test set; dictionaries are by method."""
 
     reports: list[Report]
-    tiles: list[Tile]
-    poses: dict[str, list[tuple[ImageId, ScoredPose, float | None]]]
+    tiles: list[Tile]  # drawings of the first images
+    poses: dict[str, list[tuple[ImageId, ScoredPose, float | None]]]  # candidates, seconds
     metrics: dict[str, PoseMetrics]
-    silent: dict[str, list[int]]
-    bop: dict[str, BopScores] = field(default_factory=dict)
+    silent: dict[str, list[int]]  # images with instances in which a method detected nothing
+    bop: dict[str, BopScores] = field(default_factory=dict)  # if requested and available
 
 
 def measure(
@@ -290,17 +253,11 @@ def measure(
     *,
     bop: bool = False,
 ) -> Measured:
-    """Run methods over the same images at their native size.
+    """Run methods (the baseline first) over the same images at their native size.
 
     AP, BOP scores and files of poses include all candidates; every other measure includes the
-    reported poses only. The tiles show the ground truth in green, predictions of the last method in
-    yellow and predictions of other methods in blue (paper Fig. 14).
-
-    Args:
-        methods: Methods by name, the baseline first.
-        samples: Test images.
-        num_pictures: Number of images to draw.
-        bop: Whether to compute BOP scores.
+    reported poses only. The ``num_pictures`` tiles show the ground truth in green, predictions of
+    the last method in yellow and predictions of other methods in blue (paper Fig. 14).
     """
     metrics, ranked = accumulators(methods), accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
@@ -332,34 +289,27 @@ def measure(
             measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
     scores = {name: localisation.scores() for name, localisation in localised.items()}
     measured.bop = {name: score for name, score in scores.items() if score is not None}
-    measured.reports = [
-        Report(
+    for name, method in methods.items():
+        reported, candidates_of = metrics[name], ranked[name].compute()
+        rows = {
+            part: replace(row, average_precision=candidates_of[part].average_precision)
+            for part, row in reported.compute().items()
+        }
+        names = [part.name for part in method.parts]
+        report = Report(
             name,
-            _with_precision(metrics[name].compute(), ranked[name].compute()),
-            metrics[name].references(),
-            {part.name: metrics[name].errors(part.name) for part in method.parts},
+            rows,
+            reported.references(),
+            {part: reported.errors(part) for part in names},
             method.cost(seconds[name]),
             num_images,
-            rotation_deg={
-                part.name: metrics[name].errors(part.name, "rotation_deg") for part in method.parts
-            },
+            rotation_deg={part: reported.errors(part, "rotation_deg") for part in names},
             diameters={part.name: float(part.diameter) for part in method.parts},
             test_set=seen.hexdigest(),
             details={"bop": asdict(measured.bop[name])} if name in measured.bop else {},
         )
-        for name, method in methods.items()
-    ]
+        measured.reports.append(report)
     return measured
-
-
-def _with_precision(
-    rows: Mapping[str, PoseRow], ranked: Mapping[str, PoseRow]
-) -> dict[str, PoseRow]:
-    """Return the rows of reported poses, by object, with the AP from ``ranked``, all candidates."""
-    return {
-        name: replace(row, average_precision=ranked[name].average_precision)
-        for name, row in rows.items()
-    }
 
 
 def depth_drawer() -> Draw:

@@ -1,9 +1,7 @@
 """Write Markdown pages: READMEs of runs and multiruns, comparisons and the cards of releases.
 
 The texts are jinja2 templates in ``templates/``. The README of a run states the command, the
-result, the meaning of each file and the next steps, at the start and at the end of the run.
-
-To describe a further file, add it to :data:`FILES`.
+result, the meaning of each file (:data:`FILES`) and the next steps, at its start and end.
 """
 
 from __future__ import annotations
@@ -74,28 +72,16 @@ FILES: Final = {
 }
 """Files that a run may write, ordered by relevance."""
 
+# Images that a run's README shows.
 _IMAGES: Final = [name for name in FILES if name.endswith(".png") and name != "val_auc.png"]
-"""Images that a run's README shows."""
 
-MAX_BYTES: Final = 8_000_000
-"""Maximum size of a released file, which is part of the package."""
+MAX_BYTES: Final = 8_000_000  # maximum size of a released file, which is part of the package
 
 _CARD_FIELDS: Final = (
-    "num_instances",
-    "add_01d",
-    "add_005d",
-    "pass_5cm",
-    "pass_10cm",
-    "auc_10cm",
-    "median_rotation_deg",
-    "median_translation",
-    "matching_radius",
-    "miss_rate",
-    "precision",
-    "false_per_frame",
-    "average_precision",
-    "coverage",
-)
+    "num_instances", "add_01d", "add_005d", "pass_5cm", "pass_10cm", "auc_10cm",
+    "median_rotation_deg", "median_translation", "matching_radius", "miss_rate", "precision",
+    "false_per_frame", "average_precision", "coverage",
+)  # fmt: skip
 
 
 @cache
@@ -113,10 +99,9 @@ def write_page(path: Path, template: str, **content: object) -> None:
 
 
 class RunReadme:
-    """README of a training run.
+    """README of a training run, which continues if its README cannot be written.
 
     Nothing is written before :meth:`begin`, so a run that cannot begin leaves its folder unchanged.
-    A run continues if its README cannot be written.
     """
 
     def __init__(self, config: RunConfig, run_dir: Path) -> None:
@@ -173,13 +158,7 @@ def write_run_readme(
 ) -> None:
     """Write the README of a training run, an evaluation or another job.
 
-    Args:
-        folder: Run folder.
-        title: Title of the page.
-        report: Result on the test set, if measured.
-        reason: Sentence on the state of the run, or on the reason for its end.
-        next_commands: Suggested commands.
-        is_trial: Whether the run is a trial of a search, which keeps no checkpoints.
+    ``report`` is the result on the test set, if measured. A trial of a search keeps no checkpoints.
     """
     present = read_json(folder / VERSIONS_FILE)
     calls = [call.get("command") for call in (*present.get("earlier", []), present)]
@@ -202,20 +181,16 @@ def write_run_readme(
 
 def _result_table(name: str, rows: Sequence[PoseRow]) -> str:
     """Return the Markdown table of an object: a line per measure, a column per method."""
-    lines = []
-    for measure in shown_columns(rows[0]):
-        lines.append({name: measure.heading, **{row.method: measure.text(row) for row in rows}})
-    return markdown(lines)
+    return markdown(
+        [
+            {name: measure.heading, **{row.method: measure.text(row) for row in rows}}
+            for measure in shown_columns(rows[0])
+        ]
+    )
 
 
 def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, str]) -> None:
-    """Write the README of a multirun.
-
-    Args:
-        folder: Folder of the multirun.
-        command: Words of the command.
-        jobs: State of each job by the name of its folder; empty until the multirun ends.
-    """
+    """Write the README of a multirun with the state of each job, by folder; empty until the end."""
     rows = [{"job": f"[{job}]({job}/)", "state": state} for job, state in jobs.items()]
     with best_effort(str(folder / README_FILE)):
         write_page(
@@ -231,14 +206,7 @@ def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[st
 def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Path]:
     """Write the weights ``NAME.safetensors`` and the model card ``NAME.md``; return both paths.
 
-    Args:
-        checkpoint: Checkpoint to release.
-        results: ``metrics.json`` of a run or an evaluation of the checkpoint.
-        name: Name of the release.
-        folder: Folder to write to.
-
-    Raises:
-        UserError: A file is of the wrong kind, or the release is too large.
+    ``results`` is the ``metrics.json`` of a run or an evaluation of the checkpoint.
     """
     if not name.isidentifier():
         allowed = "letters, digits and _, not starting with a digit"

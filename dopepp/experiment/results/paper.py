@@ -1,9 +1,6 @@
 """Write the runs of a sweep as a table in the paper's layout, next to the paper's values.
 
 A config describes its table under ``table`` (see ``conf/experiment/``).
-
-To add a kind of table, write a function from layout, methods and folder to rows and notes, and add
-it to :data:`KINDS`.
 """
 
 from __future__ import annotations
@@ -52,22 +49,14 @@ from dopepp.metrics.pose import MEAN
 TEXT_FILE: Final = "table.md"
 TABLE_FILE: Final = "table.csv"
 
-Printed = Mapping[str, Mapping[str, Mapping[str, int | float]]]
-"""Printed values by label, object and measure."""
+Printed = Mapping[str, Mapping[str, Mapping[str, int | float]]]  # by label, object and measure
 
-_LABELS: Final = ("method", "object", "measure")
-"""Headings of text columns."""
-
+_LABELS: Final = ("method", "object", "measure")  # headings of text columns
 _METHOD, _OBJECT, _MEASURE = _LABELS
 _STRICT: Final = "add_01d"
-_NETWORK: Final = "network"
-"""Key of the whole network's values, in place of an object."""
 _PAPER: Final = "the paper"
-
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
-_MEASURED: Final = ("poses", "shading")
-"""Kinds of tables that need trained networks."""
-_UNTRAINED: Final = "dopepp.models.backbones.VGG19"
+_MEASURED: Final = ("poses", "shading")  # kinds of tables that need trained networks
 
 
 @dataclass(frozen=True)
@@ -96,11 +85,7 @@ class PaperTable:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> PaperTable:
-        """Read the config's ``table``.
-
-        Raises:
-            UserError: A field or a value is unknown.
-        """
+        """Read the config's ``table``."""
         table = parse(cls, config, "table")
         if table.threshold not in _PASS_FIELDS:
             allowed = ", ".join(f"{threshold:g}" for threshold in _PASS_FIELDS)
@@ -110,11 +95,7 @@ class PaperTable:
 
     @classmethod
     def read(cls, path: Path) -> PaperTable:
-        """Read the ``table`` of an experiment's file, ``conf/experiment/NAME.yaml``.
-
-        Raises:
-            UserError: The file cannot be read, or its table is missing or invalid.
-        """
+        """Read the ``table`` of an experiment's file, ``conf/experiment/NAME.yaml``."""
         config = read_yaml(path)
         table = config.get("table") if isinstance(config, dict) else None
         if not isinstance(table, dict):
@@ -136,63 +117,50 @@ class PaperTable:
 
     def printed(self, label: str, measure: str) -> str:
         """Return the text of a measure that the paper prints for a network; empty without any."""
-        return _number(self.paper.get(label, {}).get(_NETWORK, {}).get(measure))
+        return _number(self.paper.get(label, {}).get("network", {}).get(measure))
 
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
-        """Return the methods by their label in the paper.
+        """Return the methods by their label in the paper, composed from the overrides of a run.
 
-        Methods whose label is missing or not unique keep their own name. The label of refined poses
-        includes the refinement.
+        Methods whose label is missing or not unique keep their own name.
         """
-        called = [self._label(entry) or entry.name for entry in entries]
+        called = []
+        for entry in entries:
+            used = entry.runs[0].overrides if entry.runs else []
+            label = " ".join(self.labels[key] for key in self.labels if key in used)
+            refine = f" + {entry.refine}" if label and entry.refine else ""
+            called.append(f"{label}{refine}" or entry.name)
         count = Counter(called)
         return {
             label if count[label] == 1 else entry.name: entry
             for label, entry in zip(called, entries, strict=True)
         }
 
-    def _label(self, entry: Entry) -> str:
-        """Return the paper's label of an entry, composed from the overrides of its run."""
-        used = entry.runs[0].overrides if entry.runs else []
-        label = " ".join(self.labels[key] for key in self.labels if key in used)
-        return f"{label} + {entry.refine}" if label and entry.refine else label
-
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
     """Print a table and write ``table.md`` and ``table.csv``; for Tables 3 and 8, also a figure."""
-    title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
-    if table.kind not in _MEASURED:  # refinement does not affect the cost of a network
-        entries = [entry for entry in entries if not entry.refine]
-    methods = table.methods(entries)
-    rows, doubts = KINDS[table.kind](table, methods, folder)
-    labels = sum(title in _LABELS for title in rows[0])
-    display.show_table(title, rows, num_labels=labels)
-    write_csv(folder / TABLE_FILE, rows, header_of(rows))
-    notes = [*_notes(table, entries), *doubts]
-    write_page(folder / TEXT_FILE, "table", title=title, table=markdown(rows), notes=notes)
-
-
-def _recipe(entries: Sequence[Entry]) -> list[str]:
-    """Return a title text with the recipes (loss and schedule) of the networks, if known."""
-    words = {str(run.config.get("recipe")) for entry in entries for run in entry.runs}
-    recipes = sorted(words & {"ours", "paper"})
-    return [f"recipe={' and '.join(recipes)}"] if recipes else []
-
-
-def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
-    """Return the notes below a table of the paper."""
-    notes = [*table.notes, *([NOTE] if table.kind == "time" else [])]
+    title, notes = table.title, list(table.notes)
+    configs = [run.config for entry in entries for run in entry.runs]
     if table.kind in _MEASURED:
+        if recipes := sorted({str(config.get("recipe")) for config in configs} & {"ours", "paper"}):
+            title += f", recipe={' and '.join(recipes)}"
         notes.append(f"The paper's pass rate is ADD < {table.threshold:g} m.")
         if any(entry.refine for entry in entries):
             notes.append(REFINED_NOTE)
-        if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
+        if any(map(_starts_untrained, configs)):
             sentence = "DOPE's VGG19 started untrained, because nothing is downloaded"
             option = "model.backbone.weights_path=FILE"
             notes.append(f"{sentence}; {option} loads weights in torchvision's format.")
+    else:  # refinement does not affect the cost of a network
+        entries = [entry for entry in entries if not entry.refine]
+        notes += [NOTE] if table.kind == "time" else []
     if not table.paper:
         notes.append("The paper has no table of these values.")
-    return notes
+    rows, doubts = KINDS[table.kind](table, table.methods(entries), folder)
+    display.show_table(title, rows, num_labels=sum(key in _LABELS for key in rows[0]))
+    write_csv(folder / TABLE_FILE, rows, header_of(rows))
+    table_and_notes = {"table": markdown(rows), "notes": [*notes, *doubts]}
+    write_page(folder / TEXT_FILE, "table", title=title, **table_and_notes)
 
 
 def _starts_untrained(config: Mapping[str, Any]) -> bool:
@@ -201,18 +169,17 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     backbone = model.get("backbone") if isinstance(model, dict) else None
     if not isinstance(backbone, dict) or config.get("init_from") not in (None, AUTO):
         return False
-    return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
+    is_vgg = backbone.get("_target_") == "dopepp.models.backbones.VGG19"
+    return is_vgg and backbone.get("weights_path") is None
 
 
-RowsAndNotes = tuple[list[Row], list[str]]
-"""Rows of a table, and notes on their uncertainty."""
+RowsAndNotes = tuple[list[Row], list[str]]  # rows of a table, and notes on their uncertainty
 
 
 def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
     """Return a row per object and method: pass rates, AUC, rotation error and paper's values.
 
-    The baseline of Δ is the first method with a result, or the first refined method for refined
-    poses. The reference rows come last.
+    The reference rows come last.
     """
     table = comparison_frame([replace(entry, name=label) for label, entry in methods.items()])
     texts: dict[tuple[str, str], Row] = {}
@@ -252,15 +219,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 def _pose_row(
     layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
 ) -> Row:
-    """Return a table row with every measure, the paper's value for the measure, and Δ.
-
-    Args:
-        layout: Layout of the paper's table.
-        method: First cell of the row.
-        name: Name of the object.
-        texts: Text of each measure and Δ, by field.
-        printed: Values that the paper prints, by key of the layout.
-    """
+    """Return a table row with the ``texts`` by field and the paper's values by key, ``printed``."""
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
         measure = layout.field(key)
@@ -282,8 +241,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     """Return the pass rates at every covered share, the paper's and Δ, and plot their curves.
 
     Rates are means over seeds. Δ refers to the first method at the same share, or to the first
-    refined method for refined poses. The interval of Δ is Student's t interval of the differences
-    between equal seeds.
+    refined method for refined poses, with Student's t interval of differences of equal seeds.
     """
     measures = layout.pass_field, _STRICT
     tables = {label: _shading(label, entry, measures) for label, entry in methods.items()}
@@ -320,8 +278,8 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
 def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
     """Return a table of a method's pass rates by object, measure, covered share and seed.
 
-    The file of a run may contain other methods, and the same method with and without refinement.
-    The mean over objects is added if each network was trained on one part.
+    The file of a run may contain other methods. The mean over objects is added if each network was
+    trained on one part.
     """
     columns = ["object", "share", "num_instances", *measures]
     tables = [pd.DataFrame(columns=["seed", *columns])]
@@ -388,10 +346,7 @@ def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Pat
 
 
 def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> RowsAndNotes:
-    """Return a row per network with its times, then a row per other method of the paper.
-
-    Plots of the frame rates are written to ``frame_rate.png`` in ``folder``.
-    """
+    """Return a row per network and per other method of the paper; plot the frame rates."""
     printed = f"{_PAPER}: ms/frame"
 
     def row(label: str, cost: Mapping[str, Any]) -> Row:

@@ -7,8 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dopepp.core.files import write_png
 from dopepp.data.formats.bop.bop_results import UNKNOWN_TIME, BopResult, results_name, write_results
 from dopepp.data.sample import SampleSource
@@ -39,7 +37,6 @@ from dopepp.experiment.results.measurement import (
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refine, refine_terms
-from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Parts
 from dopepp.recovery.recover import summary
 
@@ -80,32 +77,27 @@ def measure_and_record(
 
     Returns:
         A report per estimator, then per file.
-
-    Raises:
-        UserError: The data or a file of poses is invalid.
     """
     protocols = protocols or Protocols()
     source = held_out_source(data, parts, "test")
     numbers = object_numbers(data, parts)
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
-    methods: dict[str, Method] = {
-        **{
-            name: EstimatorMethod(estimator, parts)
-            for name, estimator in with_refining(estimators, refine, parts).items()
-        },
-        **files,
-    }
+    methods: dict[str, Method] = {}
+    for name, estimator in estimators.items():
+        methods[name] = EstimatorMethod(estimator, parts)
+        if refine is not None and estimator.has_network:
+            refined = " + ".join([name, *refine_terms(refine)])
+            methods[refined] = EstimatorMethod(refining(estimator, refine, parts), parts)
+    methods |= files
     # Impossible protocols are rejected before anything is measured.
     if protocols.shading:
-        conditions.SHADING.check_methods(methods)
         conditions.check_masks(source)
-    if protocols.scales:
-        conditions.SCALE.check_methods(methods)
     scaled = {scale: scaled_test_renders(data, parts, scale) for scale in protocols.scales}
-    views = {
-        f"{name}, {data.views} views": ViewsMethod(method.estimator, parts)
-        for name, method in methods.items()
-        if data.views > 1 and isinstance(method, EstimatorMethod) and method.takes_views
+    detectors = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
+    views = {  # poses of several views need a refinement that verifies them
+        f"{name}, {data.views} views": ViewsMethod(estimator, parts)
+        for name, estimator in detectors.items()
+        if data.views > 1 and estimator.refiner is not None and estimator.refiner.verifies
     }
     if views:
         source = with_views(source, data.views)
@@ -127,14 +119,9 @@ def measure_and_record(
     main.details.update(details or {})
     _record_coverage(run_dir, measured)
     if without_parts is not None:
-        _record_false_alarms(run_dir, methods, reports, without_parts)
+        _record_false_alarms(run_dir, detectors, reports, without_parts)
     if refines:
         main.refined = reports[-1]
-        shares = main.details["made_worse"] = made_worse(
-            measured.metrics[main.name], measured.metrics[main.refined.name]
-        )
-        in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
-        display.console.print(f"poses that refinement made worse by over 1 mm: {in_words}")
     write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -166,23 +153,8 @@ def main_report(reports: Sequence[Report]) -> Report:
     return next((report for report in reports if report.refined is not None), reports[-1])
 
 
-def with_refining(
-    estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
-) -> dict[str, PoseEstimator]:
-    """Return the estimators by name; with ``refine``, a refining copy follows each network."""
-    pairs: dict[str, PoseEstimator] = {}
-    for name, estimator in estimators.items():
-        pairs[name] = estimator
-        if refine is not None and estimator.has_network:
-            pairs[" + ".join([name, *refine_terms(refine)])] = refining(estimator, refine, parts)
-    return pairs
-
-
 def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
-    """Return a copy of an estimator that refines its poses; without ``refine``, the estimator.
-
-    Parts of the checkpoint without a mesh use the mesh of ``parts``.
-    """
+    """Return a copy of an estimator that refines its poses; without ``refine``, the estimator."""
     if refine is None:
         return estimator
     by_name = {part.name: part for part in parts}
@@ -190,25 +162,6 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
         part if part.mesh is not None else by_name.get(part.name, part) for part in estimator.parts
     ]
     return estimator.refining(refine, own_parts)
-
-
-def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
-    """Return the shares of refined poses that exceed the network's error by more than 1 mm.
-
-    Parts that are missing after refinement are ignored; the recall includes them.
-
-    Returns:
-        Shares by error: ``add`` and ``translation``.
-    """
-    shares = {}
-    for error in ("add", "translation"):
-        before, after = (
-            np.concatenate([method.errors(name, error) for name in refined.parts])
-            for method in (network, refined)
-        )
-        is_worse = (after > before + 0.001)[np.isfinite(after)]
-        shares[error] = float(is_worse.mean()) if len(is_worse) else 0.0
-    return shares
 
 
 def _record_coverage(run_dir: Path, measured: Measured) -> None:
@@ -228,11 +181,13 @@ def _record_coverage(run_dir: Path, measured: Measured) -> None:
 
 
 def _record_false_alarms(
-    run_dir: Path, methods: Mapping[str, Method], reports: Sequence[Report], frames: SampleSource
+    run_dir: Path,
+    estimators: Mapping[str, PoseEstimator],
+    reports: Sequence[Report],
+    frames: SampleSource,
 ) -> None:
-    """Measure the estimators on images without their parts, and add the counts to the reports."""
-    of_methods = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
-    alarms, tiles = count_false_alarms(of_methods, frames)
+    """Measure estimators on images without their parts, and add the counts to the reports."""
+    alarms, tiles = count_false_alarms(estimators, frames)
     for report in reports:
         report.details[KEY] = asdict(alarms[report.name])
     display.show_table(TITLE, [alarm.row(name) for name, alarm in alarms.items()])

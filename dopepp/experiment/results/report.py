@@ -11,7 +11,7 @@ import json
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -22,60 +22,33 @@ from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION
 from dopepp.metrics.row import PoseRow, mean_row
 from dopepp.parts.part import Parts
 
-_DECIMALS: Final = 6
-"""Decimals of pixels and metres in a fingerprint; further digits differ between machines."""
-
-FULL_SIZE_COST: Final = "full_size_cost"
-"""Key of ``details``: cost of a narrowed network at full width and input size."""
-
-Errors = dict[str, Float[np.ndarray, "instances"]]
-"""Error of every instance by object; infinite for missed instances."""
+Errors = dict[str, Float[np.ndarray, "instances"]]  # by object; infinite for missed instances
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a method; None if unknown.
+    """Cost of a method; None if unknown."""
 
-    Attributes:
-        parameters: Number of trained parameters.
-        gmacs: Multiply-accumulates for one image of the input size, 10⁹.
-        ms_per_frame: Median time from image to poses, milliseconds.
-    """
-
-    parameters: int | None = None
-    gmacs: float | None = None
-    ms_per_frame: float | None = None
+    parameters: int | None = None  # trained
+    gmacs: float | None = None  # 10⁹ multiply-accumulates for one image of the input size
+    ms_per_frame: float | None = None  # median time from image to poses, milliseconds
 
 
 @dataclass
 class Report:
-    """Result of a method on a test set.
-
-    Attributes:
-        name: Name of the method.
-        rows: Rows of all objects by name, followed by their mean.
-        references: Rows by object of each reference, a guess that ignores the image's content.
-        errors: ADD of every instance by object, metres.
-        cost: Cost of the method.
-        num_images: Number of test images.
-        details: Further JSON values for ``metrics.json``, by key.
-        rotation_deg: Rotation error of every instance by object, degrees.
-        diameters: Diameters of the objects, metres.
-        test_set: Fingerprint of the test set; empty if unknown.
-        refined: Result of the refined poses, or None.
-    """
+    """Result of a method on a test set."""
 
     name: str
-    rows: dict[str, PoseRow]
-    references: dict[str, dict[str, PoseRow]]
-    errors: Errors
+    rows: dict[str, PoseRow]  # by object, followed by their mean
+    references: dict[str, dict[str, PoseRow]]  # of guesses that ignore the image's content
+    errors: Errors  # ADD of every instance, metres
     cost: Cost
     num_images: int
-    details: dict[str, Any] = field(default_factory=dict)
-    rotation_deg: Errors = field(default_factory=dict)
-    diameters: dict[str, float] = field(default_factory=dict)
-    test_set: str = ""
-    refined: Report | None = None
+    details: dict[str, Any] = field(default_factory=dict)  # further values for metrics.json
+    rotation_deg: Errors = field(default_factory=dict)  # rotation error of every instance
+    diameters: dict[str, float] = field(default_factory=dict)  # metres
+    test_set: str = ""  # fingerprint; empty if unknown
+    refined: Report | None = None  # result of the refined poses
 
     @property
     def mean(self) -> PoseRow:
@@ -90,12 +63,6 @@ class Report:
             name: [row, *(rows[name] for rows in (*refined, *self.references.values()))]
             for name, row in shown_rows(self.rows).items()
         }
-
-    @property
-    def matching_radii(self) -> dict[str, float]:
-        """Largest distance between matching centres (matching radius) by object, metres."""
-        radii = {name: row.matching_radius for name, row in self.rows.items() if name != MEAN}
-        return {name: radius for name, radius in radii.items() if radius is not None}
 
     def to_record(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
@@ -215,5 +182,5 @@ class Fingerprint:
 
 
 def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
-    """Round numbers to :data:`_DECIMALS` and replace negative zeros by zero."""
-    return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
+    """Round pixels or metres, whose further digits differ between machines; avoid −0."""
+    return [float(value) + 0.0 for value in np.round(values, 6).ravel()]

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from rich.table import Table
 
 from dopepp.core import extensions
 from dopepp.core.errors import UserError
@@ -29,7 +28,6 @@ from dopepp.experiment.results.recording import (
     refining,
 )
 from dopepp.experiment.results.report import Report
-from dopepp.experiment.run.resume import warn_of_other_images
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import is_export
@@ -65,12 +63,15 @@ def tune_and_record(
 def _show(tuning: Tuning, path: Path) -> None:
     """Print the effect of tuning on test images, the tuned options and the new path."""
     shown, empty = tuning.num_images
-    title = f"tuned; measured on {shown} test images and {empty} without objects"
-    table = Table("", "network before", "after", title=title)
-    for name, before in vars(tuning.before).items():
-        after = getattr(tuning.after, name)
-        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
-    display.console.print(table)
+    rows = [
+        {
+            "": f"{name.replace('_', ' ')} %",
+            "network before": f"{100 * before:.1f}",
+            "after": f"{100 * getattr(tuning.after, name):.1f}",
+        }
+        for name, before in vars(tuning.before).items()
+    ]
+    display.show_table(f"tuned; measured on {shown} test images and {empty} without objects", rows)
     for name, value in tuning.options.items():
         display.console.print(f"recovery.{name}: {value:.4g}")
     if tuning.kept:
@@ -83,9 +84,6 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
     Unless ``data.symmetries`` is set, parts for which the test data states no symmetries have those
     of the checkpoint.
-
-    Raises:
-        UserError: The test data lacks one of the estimator's parts.
     """
     if not estimators:
         return build_parts(data)
@@ -101,34 +99,20 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
             ", ".join(names),
             "set data.root or data.parts to data of these objects",
         )
-    pairs = [(part, available[part.name]) for part in trained]
-    if data.symmetries is not None:
-        return [part for _, part in pairs]
-    return [
-        part
-        if part.has_symmetries
-        else replace(
-            part,
-            symmetries_discrete=stored.symmetries_discrete,
-            symmetries_continuous=stored.symmetries_continuous,
-        )
-        for stored, part in pairs
-    ]
+    parts = []
+    for stored in trained:
+        part = available[stored.name]
+        if stored.mesh_hash and part.mesh_hash and not part.has_shape_of(stored):
+            _log.warning("the checkpoint was trained on another shape of %s", part.name)
+        if data.symmetries is None and not part.has_symmetries:
+            discrete, continuous = stored.symmetries_discrete, stored.symmetries_continuous
+            part = replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
+        parts.append(part)
+    return parts
 
 
 def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
-    """Measure estimators and files of poses, or tune a checkpoint.
-
-    Args:
-        config: Config of ``evaluate.py``.
-        run_dir: Run folder.
-
-    Returns:
-        A report per method; none after tuning.
-
-    Raises:
-        UserError: An option, a file or the data is invalid.
-    """
+    """Measure estimators and files of poses; return a report per method, none after tuning."""
     program.quiet_lightning()
     options = EvaluationConfig.of(config)
     extensions.enable(options.extensions)
@@ -149,8 +133,6 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     share = note_on_shared_folder(data)
     if share is not None:
         display.console.print(share)
-    if checkpoint is not None:
-        warn_of_other_images(checkpoint, data, parts)
     if options.tune:
         if not isinstance(loaded[0].network, PoseNetwork):
             fix = "tune the checkpoint, then export the tuned checkpoint"
@@ -219,11 +201,13 @@ def _methods(
 def _check_combination(options: EvaluationConfig) -> None:
     """Raise a UserError for the first impossible combination of options."""
     has_network = options.ckpt_path is not None or options.baseline is not None
-    uses_templates, both = options.templates is not None, "both options together"
-    further = options.protocols or options.negatives is not None or uses_templates
+    templates, both = options.templates is not None, "both options together"
+    protocols = options.protocols
+    changes_images = bool(protocols.shading or protocols.scales)
+    further = protocols or options.negatives is not None or templates
     combinations: list[tuple[bool, str, str, str]] = [
         (
-            options.ckpt_path is None and options.results is None and not uses_templates,
+            options.ckpt_path is None and options.results is None and not templates,
             "nothing to evaluate",
             "one or more of ckpt_path=…, results=… and templates=…",
             "add ckpt_path=FILE for a checkpoint, results=FILE for a file of poses, or "
@@ -236,7 +220,7 @@ def _check_combination(options: EvaluationConfig) -> None:
             "leave out refine, or add ckpt_path",
         ),
         (
-            options.scale_error is not None and options.refine is None and not uses_templates,
+            options.scale_error is not None and options.refine is None and not templates,
             f"scale_error={options.scale_error} without refine",
             both,
             "add refine=region, or leave out scale_error",
@@ -248,10 +232,16 @@ def _check_combination(options: EvaluationConfig) -> None:
             "add negatives=FOLDER, or leave out negatives_camera",
         ),
         (
-            options.negatives is not None and not has_network and not uses_templates,
+            options.negatives is not None and not has_network and not templates,
             f"negatives={options.negatives} without ckpt_path",
             both,
             "add ckpt_path, or leave out negatives (a file has no poses on these images)",
+        ),
+        (
+            options.results is not None and changes_images,
+            f"shading or scale with results={options.results}, which has no poses on these images",
+            "checkpoints (ckpt_path, baseline)",
+            "leave out shading and scale, or results",
         ),
         (
             options.tune and bool(further),
@@ -260,16 +250,10 @@ def _check_combination(options: EvaluationConfig) -> None:
             "tune first, then evaluate the tuned checkpoint with these options",
         ),
         (
-            options.tune and options.ckpt_path is None,
-            "tune=true without ckpt_path",
+            options.tune and (options.ckpt_path is None or options.baseline is not None),
+            "tune=true with a baseline or without ckpt_path",
             "one ckpt_path, and no baseline",
-            "add ckpt_path=FILE",
-        ),
-        (
-            options.tune and options.baseline is not None,
-            "tune=true with a baseline",
-            "one ckpt_path, and no baseline",
-            "leave out baseline",
+            "add ckpt_path=FILE, and leave out baseline",
         ),
     ]
     for is_impossible, problem, allowed, fix in combinations:

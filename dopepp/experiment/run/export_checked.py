@@ -6,15 +6,15 @@ import logging
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import draft
-from dopepp.data.sample import Sample, SampleSource
+from dopepp.data.sample import SampleSource
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.config.data_config import stored_config
 from dopepp.experiment.program import entry_command
@@ -33,14 +33,13 @@ NUM_CHECKED: Final = 20  # rendered images on which the export is compared with 
 NUM_IMAGES: Final = 100  # scenes to calibrate on, and further scenes to measure on
 
 
-@dataclass(frozen=True)
-class ExportResult:
-    """A written export: path, description, agreement with the checkpoint, suggested commands."""
+class ExportResult(NamedTuple):
+    """A written export."""
 
     path: Path
     export: Export
-    agreement: ExportAgreement
-    commands: tuple[str, str]
+    agreement: ExportAgreement  # with the checkpoint
+    commands: tuple[str, str]  # to predict and to evaluate
 
 
 def export(
@@ -56,13 +55,12 @@ def export(
         path: The checkpoint.
         layout: File format, one of :data:`~dopepp.inference.export.EXPORTERS`.
         precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
-        out: Path of the export (default: next to the checkpoint, or the working directory for a
-            released checkpoint).
+        out: Path of the export; None for a path next to the checkpoint, or in the working directory
+            for a released checkpoint.
         num_images: For int8, number of rendered scenes for calibration, and of further scenes on
             which ADD-0.1d is measured.
 
     Raises:
-        UserError: The checkpoint, an option or the path is invalid, or a package is not installed.
         RunError: An fp32 export differs from the checkpoint by more than rounding, another export
             has non-finite maps, or the file cannot be written. Nothing was written.
     """
@@ -79,7 +77,9 @@ def export(
     if precision == "int8":
         _log.info("rendering %d validation scenes to calibrate on", num_images)
         for index in range(num_images, 2 * num_images):
-            images += _network_inputs(original, source.sample(index))
+            sample = source.sample(index)
+            for view in original.views(sample.image, sample.K):
+                images.append(np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]))
     save = EXPORTERS[layout][0](network, precision, images)
     described = Export(layout, precision, network.size_multiple, *cost)
     with _draft_output(target) as draft_path:
@@ -134,12 +134,6 @@ def _output_path(path: Path, layout: str, precision: str, out: Path | None) -> P
         fix = "pass another path with --out"
         raise UserError(f"--out {out}, which is the checkpoint", "the path of another file", fix)
     return out
-
-
-def _network_inputs(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
-    """Return the network's inputs for an image, each of shape (1, 3, height, width)."""
-    views = estimator.views(sample.image, sample.K)
-    return [np.ascontiguousarray(view.pixels.transpose(2, 0, 1)[None]) for view in views]
 
 
 def _accuracy(

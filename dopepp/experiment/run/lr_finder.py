@@ -9,9 +9,9 @@ that suggestion is always near the beginning of the sweep, and the running mean 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -36,29 +36,17 @@ TABLE_FILE: Final = "lr_finder.csv"
 PICTURE_FILE: Final = "lr_finder.png"
 
 _MIN_STEPS: Final = 10
-_MOST: Final = 10**6
-"""Maximum number of epochs; the number of steps ends the sweep."""
+_MOST: Final = 10**6  # maximum number of epochs; the number of steps ends the sweep
 
-_SMOOTHING: Final = 0.05
-"""Standard deviation of the smoothing as a share of the sweep, against the noise of batches."""
-_SKIPPED: Final = 0.1
-"""Ignored share at the beginning of the sweep, in which the optimiser's averages and the statistics
-of batch norm settle."""
-_MIN_FALL: Final = 0.05
-"""Minimum relative fall of the loss for a suggestion."""
-
+_SMOOTHING: Final = 0.05  # standard deviation of the smoothing, share of the sweep
+_SKIPPED: Final = 0.1  # share of the sweep in which optimiser and batch norm settle
+_MIN_FALL: Final = 0.05  # minimum relative fall of the loss for a suggestion
 
 Steps = Float[np.ndarray, "steps"]
 
 
-@dataclass(frozen=True)
-class Suggestion:
-    """Suggested learning rate.
-
-    Attributes:
-        steepest: Rate at which the loss falls fastest, which is the suggestion.
-        lowest: Rate with the lowest loss; the loss diverges above it.
-    """
+class Suggestion(NamedTuple):
+    """Learning rates: the suggestion, where the loss falls fastest, and that of the lowest loss."""
 
     steepest: float
     lowest: float
@@ -68,10 +56,6 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     """Train with a growing learning rate; print, write and return a suggested rate, if any.
 
     The sweep uses the chosen optimiser without schedule, validation and checkpoints.
-
-    Raises:
-        UserError: An option is invalid.
-        RunError: The loss diverges within the first steps.
     """
     if config.resume is not None:
         raise UserError(
@@ -102,20 +86,14 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
 
 def _short_training(config: RunConfig) -> RunConfig:
     """Return a config for training on one device without schedule, validation and callbacks."""
-    trainer = replace(
-        config.trainer,
-        max_steps=-1,
-        max_epochs=_MOST,
-        devices=1,
-        num_nodes=1,
-        strategy="auto",
-        lightning={
-            **config.trainer.lightning,
-            "check_val_every_n_epoch": _MOST,
-            "val_check_interval": None,
-            "enable_checkpointing": False,
-        },
-    )
+    lightning = {
+        **config.trainer.lightning,
+        "check_val_every_n_epoch": _MOST,
+        "val_check_interval": None,
+        "enable_checkpointing": False,
+    }
+    one = {"devices": 1, "num_nodes": 1, "strategy": "auto", "lightning": lightning}
+    trainer = replace(config.trainer, max_steps=-1, max_epochs=_MOST, **one)
     return replace(config, trainer=trainer, scheduler={}, callbacks={}, ema=None)
 
 

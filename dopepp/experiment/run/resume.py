@@ -27,8 +27,6 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_file
 from dopepp.core.yaml import read_yaml
 from dopepp.data.sample import DescribedSource, Sample
-from dopepp.experiment.assembly.build_sources import held_out_source
-from dopepp.experiment.config.data_config import DataConfig, evaluation_data, stored_config
 from dopepp.experiment.config.run_config import RunConfig, flatten, is_below
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
@@ -39,7 +37,6 @@ from dopepp.experiment.results.folder import (
 )
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
-from dopepp.parts.part import Parts
 
 _log = logging.getLogger(__name__)
 
@@ -80,15 +77,9 @@ def check_resume(
 ) -> list[ConfigDifference]:
     """Return the accepted differences between a run and the config that resumes it.
 
-    Args:
-        run: Folder of the interrupted run.
-        config: Present config.
-        saved: Last checkpoint of the run.
-        payload: Description of a checkpoint of the present config.
-
-    Raises:
-        UserError: The network or the kind of optimiser differs, or the data or the loss differ and
-            ``resume_anyway`` is not set.
+    ``saved`` is the last checkpoint of the run, ``payload`` the description of a checkpoint of the
+    present config. A UserError is raised if the network or the kind of optimiser differs, or the
+    data or the loss without ``resume_anyway``.
     """
     path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
@@ -134,14 +125,13 @@ def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[C
 
 def image_differences(saved: object, present: object) -> list[ConfigDifference]:
     """Return the splits (train, val) whose descriptions in two checkpoints differ, with reasons."""
-    if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
-        return []  # the checkpoint was not written by train.py
-    return [
-        ConfigDifference(f"{split} images", ("as trained on", f"changed ({'; '.join(lines)})"))
-        for split in ("train", "val")
-        for lines in [differing_images(saved[split], present[split])]
-        if lines
-    ]
+    differences: list[ConfigDifference] = []
+    if isinstance(saved, Mapping) and isinstance(present, Mapping):  # both written by train.py
+        for split in ("train", "val"):
+            if lines := differing_images(saved[split], present[split]):
+                changed = f"changed ({'; '.join(lines)})"
+                differences.append(ConfigDifference(f"{split} images", ("as trained on", changed)))
+    return differences
 
 
 def trusted_overrides(stored: object, source: Path) -> list[str]:
@@ -149,20 +139,14 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
     A run folder is not trusted. Hydra's flags and nodes could execute arbitrary code, so they are
     not read from a folder.
-
-    Raises:
-        UserError: The stored value is not a list of overrides.
     """
-    if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
-        fix = "restore the file from backup, or start a new run"
-        raise UserError(f"{source} without a list of overrides", "key=value lines", fix)
+    texts = stored if isinstance(stored, list) else [stored]
+    matches = [_OVERRIDE.fullmatch(text) if isinstance(text, str) else None for text in texts]
     kept = []
-    for text in stored:
-        match = _OVERRIDE.fullmatch(text)
+    for text, match in zip(texts, matches, strict=True):
         if match is None:
-            problem, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
             fix = "restore the file from backup, or start a new run"
-            raise UserError(problem, allowed, fix)
+            raise UserError(f"{source} with {text!r:.100}", "a list of overrides key=value", fix)
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
@@ -206,17 +190,14 @@ def _task(hydra: object) -> object:
 
 
 def _listed(differences: Sequence[ConfigDifference]) -> str:
-    """Join differences of options into a text; without any, the number of objects differs."""
+    """Join differences of options; without any, the number of objects differs."""
     return ", ".join(map(str, differences)) or "the number of objects"
 
 
 _THUMBNAIL_SIZE: Final = (16, 12)
-_MAX_LEVELS: Final = 2.0
-"""Mean difference of two small images, in grey levels, above which they count as different."""
-_MAX_LABEL: Final = 1e-4
-"""Difference of camera matrices (relative) or poses (metres) that counts as a change."""
-_LONG: Final = 40
-"""Maximum number of characters of a shown value."""
+_MAX_LEVELS: Final = 2.0  # smallest mean difference of two thumbnails, grey levels
+_MAX_LABEL: Final = 1e-4  # smallest change of camera matrices (relative) or poses (metres)
+_LONG: Final = 40  # maximum number of characters of a shown value
 
 
 def describe_images(source: DescribedSource) -> dict[str, Any]:
@@ -231,8 +212,7 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
     """Return descriptions of the differences between two results of :func:`describe_images`.
 
-    Descriptions of presets are ignored, because a new version may add fields to a preset. Changed
-    presets are recognised by the labels and pixels of the first image.
+    Presets are compared by the first image only, because a new version may add fields to a preset.
     """
     old, new = dict(flatten(stored["sources"])), dict(flatten(present["sources"]))
     presets = {f"{source}.preset" for source in present["sources"]}
@@ -280,41 +260,3 @@ def _shown(value: object) -> str:
     """Return a value as text, cut after :data:`_LONG` characters."""
     text = str(value)
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"
-
-
-def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
-    """Warn if the parts' shapes, or the test images of equal options, differ from the checkpoint's.
-
-    Args:
-        checkpoint: Checkpoint to evaluate.
-        data: Test data; data with other options are not compared.
-        parts: Objects of the checkpoint, as defined by the test data.
-    """
-    pairs = zip(checkpoint.parts, parts, strict=True)
-    others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash and not a.has_shape_of(b)]
-    if others:
-        _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
-    stored, config = checkpoint.data.get("images"), stored_config(checkpoint.data)
-    if not isinstance(stored, dict) or config is None:
-        return  # the checkpoint was not written by train.py
-    try:
-        trained_data = evaluation_data(None, None, config, "the checkpoint")
-    except UserError:
-        return  # the data config of the checkpoint cannot be read
-    if _test_set(trained_data) != _test_set(data):
-        return
-    present = describe_images(held_out_source(data, parts, "test"))
-    differences = differing_images(stored["test"], present)
-    if differences:
-        _log.warning(
-            "the test images have changed since the checkpoint was measured, although the "
-            "configuration is equal: %s",
-            "; ".join(differences),
-        )
-
-
-def _test_set(data: DataConfig) -> list[object]:
-    """Return the options of a config that define its test images."""
-    named = (data.format, data.root, data.objects, data.parts, data.unit, data.frames, data.virtual)
-    chosen = (data.image_sets, data.num_test, data.eval_seed, data.test.renderer, data.targets)
-    return [*named, *chosen, data.classes or {}]

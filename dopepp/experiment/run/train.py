@@ -7,7 +7,6 @@ name to :class:`~dopepp.experiment.config.run_config.RunConfig`.
 from __future__ import annotations
 
 import logging
-import shlex
 import shutil
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -28,15 +27,13 @@ from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_ca
 from dopepp.experiment.assembly.build_system import (
     build_system,
     build_trainer,
-    estimate_training_s,
     keep_freed_memory,
 )
 from dopepp.experiment.assembly.photos import held_out_photos
-from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
 from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.conditions import check_masks
-from dopepp.experiment.results.cost import full_size_cost, measure_cost
+from dopepp.experiment.results.cost import measure_cost
 from dopepp.experiment.results.folder import (
     LAST_CHECKPOINT,
     OBJECTIVE,
@@ -46,7 +43,7 @@ from dopepp.experiment.results.folder import (
 )
 from dopepp.experiment.results.paper import PaperTable
 from dopepp.experiment.results.recording import measure_and_record, refining
-from dopepp.experiment.results.report import FULL_SIZE_COST, Report
+from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.evaluate import tune_and_record
 from dopepp.experiment.run.lr_finder import find_learning_rate
 from dopepp.experiment.run.resume import (
@@ -70,9 +67,6 @@ from dopepp.training.throughput import FOLDER as PROFILE
 from dopepp.training.throughput import profile_rows
 
 _log = logging.getLogger(__name__)
-
-PAPER_INPUT_SIZE: Final = (416, 416)
-QUICKSTART: Final = "experiment=quickstart"
 
 
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
@@ -103,7 +97,6 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
     Raises:
-        UserError: An option, a file or the data is invalid.
         PrunedError: A search stopped the training.
         Interruption: A signal ended the training; the message names the last checkpoint.
     """
@@ -113,7 +106,9 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
             report = _train(config, run_dir, readme, trackers)
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
-        advice = _advice(run_dir)
+        step = saved_step(run_dir / LAST_CHECKPOINT)
+        saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
+        advice = f"{saved}; continue with resume={run_dir}"
         readme.end(pages.INTERRUPTED, advice)
         raise Interruption(number, advice) from interrupt
     except PrunedError as pruned:
@@ -173,9 +168,6 @@ def _train(
         for tracker in trackers:
             tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
-    for line in template_commands(config.data):
-        display.console.print(f"available now, without training: {line}", soft_wrap=True)
-    _announce_duration(config.trainer, system, datamodule, trainer)
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:
@@ -237,41 +229,6 @@ def _print_outcome(trainer: Trainer, run_dir: Path) -> None:
         display.show_table(f"running time by function; details in {run_dir / PROFILE}", rows)
 
 
-def _announce_duration(
-    options: TrainerConfig, system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
-) -> None:
-    """On a CPU, print the expected duration and, from one hour, the command of the quickstart."""
-    if trainer.accelerator.__class__.__name__ != "CPUAccelerator" or not trainer.is_global_zero:
-        return
-    seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
-    hours = seconds / 3600
-    duration = f"{hours:,.1f} hours" if hours >= 1 else f"{max(1, round(seconds / 60))} min"
-    quick = f"; for a first result in minutes: {program.entry_command('train')} {QUICKSTART}"
-    advice = quick if hours >= 1 else ""
-    display.console.print(f"no accelerator: about {duration} to finish{advice}")
-
-
-def template_commands(data: DataConfig) -> list[str]:
-    """Return a command for each part that estimates poses by templates with the user's camera.
-
-    Without a camera, and for the objects of a data set, there are no commands.
-    """
-    virtual, lens = data.virtual, data.virtual.camera
-    if data.root is not None or lens is None or virtual.working_distance is None:
-        return []
-    words = ["--K", *(f"{value:g}" for value in (lens.fx, lens.fy, lens.cx, lens.cy))]
-    words += ["--working-distance", ",".join(f"{metres:g}" for metres in virtual.working_distance)]
-    if data.unit is not None:
-        words += ["--unit", data.unit]
-    tilt_deg = getattr(data.preset.turning, "tilt_deg", None)
-    if tilt_deg is not None and data.preset.table is None:
-        words += ["--tilt", f"{tilt_deg:g}"]
-    return [
-        shlex.join(["dopepp", "predict", part, "IMAGE", *words, "--save", "out"])
-        for part in data.parts
-    ]
-
-
 def _resume_path(
     config: RunConfig, system: PoseSystem
 ) -> tuple[Path | None, list[ConfigDifference]]:
@@ -299,13 +256,6 @@ def _resume_path(
     return path, check_resume(run_dir, config, checkpoint, system.payload)
 
 
-def _advice(run_dir: Path) -> str:
-    """Return a text with the last saved step of an interrupted run, and how to resume it."""
-    step = saved_step(run_dir / LAST_CHECKPOINT)
-    saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
-    return f"{saved}; continue with resume={run_dir}"
-
-
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:
     """Measure the best checkpoint of a run, after tuning if ``tune`` is set, and record it."""
     savers = [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]
@@ -327,9 +277,6 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
     score = savers[0].best_model_score if savers else None
     if score is not None and score.isfinite():
         details[OBJECTIVE] = float(score)
-    if config.model.width != 1.0:
-        cost = full_size_cost(estimator.checkpoint.spec, PAPER_INPUT_SIZE)
-        details[FULL_SIZE_COST] = vars(cost)
     return measure_and_record(
         {config.model.name: estimator},
         parts,

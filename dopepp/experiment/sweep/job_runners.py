@@ -130,12 +130,9 @@ def on_joblib(n_jobs: int) -> Runner:
 
 
 def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
-    """Return a runner that runs jobs on a Ray cluster.
+    """Return a runner on a Ray cluster at ``host:port``; None starts a cluster on this machine.
 
-    Args:
-        address: ``host:port`` of the cluster; None starts a cluster on this machine.
-        num_cpus: Cores per job.
-        num_gpus: GPUs per job; may be a fraction.
+    A job takes ``num_cpus`` cores and ``num_gpus`` GPUs, which may be a fraction.
     """
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:

@@ -50,8 +50,8 @@ class AnnounceJobs(Callback):
 class CompareJobs(Callback):
     """Hydra callback that compares the jobs at the end of a multirun.
 
-    Hydra skips the callback if a job raises. Therefore a failing job writes ``failed.json`` and
-    returns, and the callback ends the multirun with exit code 1 after the comparison.
+    Hydra skips it if a job raises. Therefore a failing job writes ``failed.json`` and returns, and
+    the callback ends the multirun with exit code 1 after the comparison.
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -61,11 +61,7 @@ class CompareJobs(Callback):
         write_multirun_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the comparison of all jobs.
-
-        Raises:
-            SystemExit: A job failed; the exit code is 1.
-        """
+        """Write the comparison of all jobs; exit with code 1 if a job failed."""
         if not compare_jobs(Path(str(config.hydra.sweep.dir)), config):
             raise SystemExit(1)
 
@@ -140,10 +136,7 @@ def _redirect(targets: list[int]) -> None:
 
 
 def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
-    """Return whether the folder holds the last checkpoint of a run with the same config.
-
-    Requeued SLURM jobs and restarted searches continue in their folder.
-    """
+    """Return whether the folder holds the last checkpoint of a run with the same config."""
     from dopepp.experiment.results.folder import CONFIG_FILE, LAST_CHECKPOINT
     from dopepp.experiment.run.resume import config_differences
 

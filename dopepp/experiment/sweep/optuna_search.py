@@ -73,12 +73,7 @@ def search(
     arguments: Sequence[str],
     swept: Sequence[str],
 ) -> list[JobReturn]:
-    """Run trials until ``search.num_trials`` trials of the study are complete, pruned or failed.
-
-    Raises:
-        UserError: An option of the search is wrong, the study belongs to another command, or the
-            experiment already sweeps over options (``swept``).
-    """
+    """Run trials until ``search.num_trials`` trials of the study are complete, pruned or failed."""
     if swept:
         raise UserError(
             f"search=optuna with an experiment that already sweeps over {', '.join(swept)}",
@@ -180,11 +175,7 @@ def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
 
 
 def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
-    """Read the search space; overrides of the command line take precedence.
-
-    Raises:
-        UserError: An entry is not a sweep, or no option is varied.
-    """
+    """Read the search space; overrides of the command line take precedence."""
     parser = OverridesParser.create(config_loader=loader)
     try:
         entries = parser.parse_overrides([str(text) for text in space])
@@ -271,11 +262,7 @@ def search_overrides(params: dict[str, object]) -> list[str]:
 
 @contextmanager
 def exclusive_search(folder: Path, study: str) -> Iterator[None]:
-    """Lock a folder against a second search, until the context or the process ends.
-
-    Raises:
-        UserError: Another command is searching in the folder.
-    """
+    """Lock a folder against a second search, until the context or the process ends."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".search.lock").open("w") as stream:
         try:
@@ -291,15 +278,10 @@ def exclusive_search(folder: Path, study: str) -> Iterator[None]:
 
 
 def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
-    """Open or create the Optuna study of a search.
+    """Open or create the Optuna study of the node ``search``.
 
-    Args:
-        options: Node ``search`` of the config.
-        facts: Fixed options that affect the result of a trial, and the search space, as text.
-        seed: Seed of the sampler, to which the number of stored trials is added.
-
-    Raises:
-        UserError: The study was created with other options, or its storage cannot be opened.
+    ``facts`` are the fixed options that affect the result of a trial, and the search space. The
+    number of stored trials is added to the sampler's ``seed``.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = str(options["study"])

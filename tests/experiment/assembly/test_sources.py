@@ -33,13 +33,8 @@ def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
 
 def test_without_a_root_all_images_are_rendered_with_one_warning(tiny, caplog):
     data = tiny("data=hybrid", "data.parts=[servoholder,pivconnector]").data
-    expected = {
-        ("train", "virtual"): (8, 8),
-        ("val", "virtual"): (2, 2),
-        ("test", "virtual"): (3, 3),
-    }
     with caplog.at_level(logging.WARNING):
-        assert counts(data) == expected
+        assert list(counts(data).values()) == [(8, 8), (2, 2), (3, 3)]
     (line,) = [record.getMessage() for record in caplog.records]
     assert "no real images" in line
     assert "servoholder, pivconnector" in line
@@ -164,28 +159,19 @@ def test_preset_changes_reach_the_renders(tiny):
     assert fx[0] < fx[1]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (
-            ("data=bop",),
-            "the last 10% of the images in train_pbr, which is shared with "
-            "train and val; data.image_sets.train=none data.image_sets.val=none measures",
-        ),
-        (
-            ("data=bop", "data.image_sets.val=other"),
-            "the last 20% of the images in train_pbr, "
-            "which is shared with train; data.image_sets.train=none measures",
-        ),
-        (("data=ndds",), "the last 10% of the images in ., which"),
-        (("data=bop", "data.image_sets.test=test"), None),
-        (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
-        (("data=bop", "data/test=photoreal"), None),
-        (("data=ycb_video",), None),
-        (("data=ndds", "data.format=posed"), None),
-        (("data=virtual",), None),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "words"), [
+    (("data=bop",), "the last 10% of the images in train_pbr, which is shared with train and val; "
+                    "data.image_sets.train=none data.image_sets.val=none measures"),
+    (("data=bop", "data.image_sets.val=other"), "the last 20% of the images in train_pbr, "
+        "which is shared with train; data.image_sets.train=none measures"),
+    (("data=ndds",), "the last 10% of the images in ., which"),
+    (("data=bop", "data.image_sets.test=test"), None),
+    (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
+    (("data=bop", "data/test=photoreal"), None),
+    (("data=ycb_video",), None),
+    (("data=ndds", "data.format=posed"), None),
+    (("data=virtual",), None),
+])  # fmt: skip
 def test_a_shared_folder_is_reported_with_overrides_that_change_the_share(overrides, words, tiny):
     root = () if "data=virtual" in overrides else ("data.root=somewhere",)
     note = note_on_shared_folder(tiny(*overrides, *root).data)

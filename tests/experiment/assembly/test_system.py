@@ -1,16 +1,10 @@
-from dataclasses import replace
-
 import pytest
 import torch
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly import build_system as built
-from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule
 from dopepp.experiment.assembly.build_system import (
-    build_system,
     choose_precision,
-    estimate_training_s,
 )
 from dopepp.experiment.config.run_config import TrainerConfig
 
@@ -35,22 +29,6 @@ def test_bf16_needs_fast_hardware(accelerator, vendor, flags, gpu_is_fast, expec
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
     assert choose_precision("auto", accelerator)[0] == expected
     assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as requested")
-
-
-def test_the_estimated_duration_grows_with_the_steps_and_the_network_is_unchanged(tiny):
-    config = tiny("model.backbone.batch_norm=true")
-    parts = build_parts(config.data)
-    module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
-    before = {name: value.clone() for name, value in system.network.state_dict().items()}
-    long, short = (
-        estimate_training_s(system.network, module, replace(config.trainer, **limits), "32-true")
-        for limits in ({"max_epochs": 1000, "max_steps": -1}, {"max_epochs": 1000, "max_steps": 2})
-    )
-    assert 0 < short < long
-    assert system.network.training
-    for name, value in system.network.state_dict().items():
-        assert torch.equal(value, before[name]), f"{name} has changed"
-    assert all(parameter.grad is None for parameter in system.network.parameters())
 
 
 @pytest.fixture(autouse=True)

@@ -12,63 +12,40 @@ from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES
 from dopepp.experiment.config.run_config import EvaluationConfig, Protocols, RunConfig
 from dopepp.experiment.entries import entry
 
+WRONG = (
+    "+speed=1", "seed=-1", "seed=1.5", "compile=1", "ema=nan", "num_empty=0", "num_empty=2.5",
+    "maps.sigma=0", "false_positive_rate=1.5", "data.eval_seed=-1", "data.batch_size=0",
+    "data.num_val=0", "data.num_workers=-1", "data.real_fraction=1.5", "data.input_size=64",
+    "data.root=1", "lr_finder.num_steps=9", "trainer.max_epochs=0", "+trainer.num_nodes=0",
+    "trainer.ddp_timeout_s=0", "cost.batch_size=0.5", "stop_at=1.5",
+)  # fmt: skip
 
-@pytest.mark.parametrize(
-    ("override", "got"),
-    [
-        *(
-            (option, option.lstrip("+"))
-            for option in (
-                "+speed=1",
-                "seed=-1",
-                "seed=1.5",
-                "compile=1",
-                "ema=nan",
-                "num_empty=0",
-                "num_empty=2.5",
-                "false_positive_rate=1.5",
-                "maps.sigma=0",
-                "data.eval_seed=-1",
-                "data.batch_size=0",
-                "data.num_val=0",
-                "data.num_workers=-1",
-                "data.real_fraction=1.5",
-                "data.input_size=64",
-                "data.root=1",
-                "lr_finder.num_steps=9",
-                "trainer.max_epochs=0",
-                "+trainer.num_nodes=0",
-                "trainer.ddp_timeout_s=0",
-                "cost.batch_size=0.5",
-            )
-        ),
-        ("+data.colour=red", "data.colour='red'"),
-        ("+virtual.colour=red", "virtual.colour='red'"),
-        ("++data.virtual.preset=table", "data.virtual={'preset': 'table'}"),
-        ("+virtual.scene.colour=red", "virtual.scene.colour='red'"),
-        ("++virtual.scene.turning.tilt_deg=-1", "virtual.scene.turning.tilt_deg=-1"),
-        ("virtual.preset=blue", "preset 'blue'"),
-        ("~data.batch_size", "no data.batch_size"),
-        ("~trainer", "no trainer.max_epochs"),
-        ("data.parts=pivconnector", "data.parts='pivconnector'"),
-        ("job=mow", "job='mow'"),
-        ("seed=true", "seed=True"),
-        ("tune=maybe", "tune='maybe'"),
-        ("ema=slow", "ema='slow'"),
-        ("resume=[a]", "resume=['a']"),
-        ("recovery.max_peaks=all", "recovery.max_peaks='all'"),
-        ("data.parts=[1]", "data.parts[0]=1"),
-        ("data.batch_size=many", "data.batch_size='many'"),
-        ("data.input_size=[100,64]", "data.input_size=[100, 64]"),
-        ("data.cache=tape", "data.cache='tape'"),
-        ("data.test.cache=tape", "data.test.cache='tape'"),
-        ("data.masking=none", "data.masking='none'"),
-        ("data.image_sets={train: 1}", "data.image_sets.train=1"),
-        ("model.backbone=vgg", "model.backbone='vgg'"),
-        ("lr_finder.max_lr=1e-7", "lr_finder.max_lr=1e-07"),
-        ("trainer.profiler=slow", "trainer.profiler='slow'"),
-    ],
-)
+
+@pytest.mark.parametrize(("override", "got"), [
+    *((option, option.lstrip("+")) for option in WRONG),
+    ("+data.colour=red", "data.colour='red'"),
+    ("+virtual.colour=red", "virtual.colour='red'"),
+    ("++data.virtual.preset=table", "data.virtual={'preset': 'table'}"),
+    ("+virtual.scene.colour=red", "virtual.scene.colour='red'"),
+    ("++virtual.scene.turning.tilt_deg=-1", "virtual.scene.turning.tilt_deg=-1"),
+    ("virtual.preset=blue", "preset 'blue'"),
+    ("~data.batch_size", "no data.batch_size"),
+    ("~trainer", "no trainer.max_epochs"),
+    ("data.parts=pivconnector", "data.parts='pivconnector'"),
+    ("job=mow", "job='mow'"),
+    ("seed=true", "seed=True"),
+    ("tune=maybe", "tune='maybe'"),
+    ("resume=[a]", "resume=['a']"),
+    ("recovery.max_peaks=all", "recovery.max_peaks='all'"),
+    ("data.parts=[1]", "data.parts[0]=1"),
+    ("data.input_size=[100,64]", "data.input_size=[100, 64]"),
+    ("data.test.cache=tape", "data.test.cache='tape'"),
+    ("data.masking=none", "data.masking='none'"),
+    ("data.image_sets={train: 1}", "data.image_sets.train=1"),
+    ("model.backbone=vgg", "model.backbone='vgg'"),
+    ("lr_finder.max_lr=1e-7", "lr_finder.max_lr=1e-07"),
+    ("trainer.profiler=slow", "trainer.profiler='slow'"),
+])  # fmt: skip
 def test_a_wrong_option_is_named(override, got, composed):
     with pytest.raises(UserError) as error:
         RunConfig.of(composed(override))
@@ -116,43 +93,21 @@ SHARES = r"shading=.*; allowed: shares .* 0 to 1"
 FACTORS = r"scale=.*; allowed: factors from 0\.05 to 20"
 
 
-@pytest.mark.parametrize(
-    ("option", "given", "message"),
-    [
-        (
-            "by",
-            ["distance", "colour"],
-            r"by=\['distance', 'colour'\]; allowed: one or more of "
-            r"distance, visibility, size, rotation",
-        ),
-        *(("by", wrong, "by=.*; allowed") for wrong in ("sice", [], [["size"]])),
-        *(
-            ("shading", wrong, SHARES)
-            for wrong in ([0.2, 80], "20%", [True], [], [0], [float("nan")], {"a": 1})
-        ),
-        *(
-            ("scale_factors", wrong, FACTORS)
-            for wrong in (
-                0,
-                [0.5, 0],
-                [-1],
-                [float("nan")],
-                [float("inf")],
-                [21],
-                [1],
-                [],
-                "big",
-                [True],
-                {"a": 2},
-            )
-        ),
-        ("num_bins", 0, "num_bins=0; allowed: an integer from 1"),
-    ],
-)
-def test_wrong_options_are_reported_in_one_line(option, given, message):
-    with pytest.raises(UserError, match=message) as error:
-        Protocols.of({**OPTIONS, option: given})
-    assert "\n" not in str(error.value)
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(("option", "message", "given"), [
+    ("by", "by=.*; allowed: one or more of distance, visibility, size, rotation",
+     [["distance", "colour"], "sice", [], [["size"]]]),
+    ("shading", SHARES, [[0.2, 80], "20%", [True], [], [0], [NAN], {"a": 1}]),
+    ("scale_factors", FACTORS, [0, [0.5, 0], [-1], [NAN], [INF], [21], [1], [], "big", [True]]),
+    ("num_bins", "num_bins=0; allowed: an integer from 1", [0]),
+])  # fmt: skip
+def test_wrong_options_are_reported_in_one_line(option, message, given):
+    for value in given:
+        with pytest.raises(UserError, match=message) as error:
+            Protocols.of({**OPTIONS, option: value})
+        assert "\n" not in str(error.value)
 
 
 def test_levels_are_sorted_and_unique():

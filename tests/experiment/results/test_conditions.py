@@ -24,7 +24,7 @@ from dopepp.experiment.results.conditions import (
     record_condition,
 )
 from dopepp.experiment.results.frame import ADD_01D, ADD_5CM
-from dopepp.experiment.results.measurement import FileMethod, FilePose, ImageId, measure
+from dopepp.experiment.results.measurement import FilePose, ImageId, measure
 from dopepp.experiment.results.report import Cost
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
@@ -155,10 +155,6 @@ def test_impossible_conditions_are_rejected_early(tiny):
     check_masks(discs())
     with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
         check_masks(discs(masks=False))
-    for condition in (SHADING, SCALE):
-        condition.check_methods(METHODS)
-        with pytest.raises(UserError, match=f"{condition.name} with results of posecnn"):
-            condition.check_methods({**METHODS, "posecnn": FileMethod.__new__(FileMethod)})
     data = replace(tiny().data, root=Path("photos"))
     with pytest.raises(UserError, match=r"scale=2 on the images in data\.root=") as error:
         scaled_test_renders(data, [], 2.0)

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 import torch
 
-from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.assembly.build_parts import build_parts
@@ -21,7 +20,6 @@ from dopepp.experiment.results.cost import (
     measure_cost,
     time_frames,
 )
-from dopepp.experiment.run.train import do_job
 from dopepp.geometry.camera import transform
 from dopepp.maps.codec import MapGeometry
 
@@ -48,12 +46,6 @@ def test_counts_match_the_paper_and_times_are_written(parsed, tmp_path, capsys):
     assert stated == pytest.approx(medians, rel=1e-2)
     assert "maps to poses" in capsys.readouterr().out
     assert read_rgb(tmp_path / "frame_rate.png").std() > 0
-
-
-def test_a_rejected_job_writes_nothing(composed, tmp_path):
-    with pytest.raises(UserError, match=r"recovery\.max_peaks=0"):
-        do_job(composed(*SMALL, "job=cost", "recovery.max_peaks=0"), tmp_path)
-    assert not any(tmp_path.iterdir())
 
 
 def estimator_of(config: RunConfig) -> tuple[SimulatedMapsEstimator, MapGeometry, DescribedSource]:

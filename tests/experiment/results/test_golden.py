@@ -32,8 +32,9 @@ from dopepp.experiment.results.pages import release
 from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import COLUMNS, PoseRow, mean_row
-from dopepp.models.checkpoint import Checkpoint, read, write_atomic
+from dopepp.models.checkpoint import Checkpoint, read
 from dopepp.models.network import build_network
+from dopepp.models.storage import write_atomic
 from dopepp.parts import load_part
 from tests.experiment.conftest import report_of, write_run
 
@@ -87,7 +88,6 @@ def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden):
         errors = rng.gamma(1, 0.01 if model == "dope" else 0.004, 60)
         overrides = [f"model={model}", f"seed={seed}", "data=virtual"]
         result = report_of(model, {"bolt": errors, "nut": errors[::-1] * 1.01}, refined=errors / 2)
-        result.details["full_size_cost"] = {"parameters": 7, "gmacs": 2.5, "ms_per_frame": None}
         write_run(Path("sweep", str(number)), overrides, result)
     write_run(Path("sweep", "4"), ["model=other", "seed=1"], "got x=[1] | y; allowed: [2]; fix: z")
     write_json(write_run(Path("sweep", "5"), ["model=p"]) / "pruned.json", {"reason": "bad"})

@@ -10,10 +10,8 @@ from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
-from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.results.compare import compare_paths
 from dopepp.experiment.results.paper import PaperTable
-from dopepp.experiment.run.train import do_job
 from dopepp.experiment.sweep.multirun import CompareJobs
 from tests.experiment.conftest import report_of, write_run
 
@@ -48,39 +46,6 @@ def test_parts_with_other_seeds_are_not_joined(tmp_path):
         result = report_of("x", {part: ERRORS}, test_set=part)
         write_run(tmp_path / str(number), [f"seed={number}"], result, data={"parts": [part]})
     assert "mean" not in [row["object"] for row in end(tmp_path, {"title": "Table 2"})]
-
-
-def test_shading_table_has_refined_rows_and_no_other_methods(tmp_path):
-    for number, model in enumerate(("dope", "dopepp")):
-        result = report_of("x", ERRORS, refined=ERRORS)
-        folder = write_run(tmp_path / str(number), [f"model={model}"], result, model=model)
-        rates = {"other": 0.9, "other + region": 0.8, "x": 0.1, "x + region": 0.2 + number / 2}
-        lines = [f"{name},part,0.2,10,{rate},{rate}\n" for name, rate in rates.items()]
-        header = "method,object,share,num_instances,pass_5cm,add_01d\n"
-        (folder / "shading.csv").write_text(header + "".join(lines))
-    table = {"title": "Table 3", "kind": "shading", "labels": LABELS}
-    rows = end(tmp_path, {**table, "paper": {"DOPE": {"part": {"20 %": 14.1, "80 %": 3.0}}}})
-    lenient = [row for row in rows if row["measure"] == "ADD<5cm %"]
-    assert [(row["method"], row["20 %"], row["80 %"]) for row in lenient] == [
-        ("DOPE", "10.0", ""), ("DOPE, the paper", "14.1", "3.0"),
-        ("DOPE + region", "20.0", ""), ("Δ DOPE + region", "+10.0", ""),
-        ("DOPE++", "10.0", ""), ("Δ DOPE++", "+0.0", ""),
-        ("DOPE++ + region", "70.0", ""), ("Δ DOPE++ + region", "+50.0", ""),
-    ]  # fmt: skip
-    assert read_rgb(tmp_path / "table_shading.png").std() > 0
-
-
-def test_costs(composed, tmp_path):
-    small = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=3", "cost.batch_size=2")
-    for number, name in enumerate(("dope", "dopepp")):
-        folder = write_run(tmp_path / str(number), [f"model={name}"])
-        do_job(composed("experiment=table8_time", f"model={name}", *small), folder)
-    dope, dopepp = end(tmp_path, {"title": "4", "kind": "parameters", "labels": LABELS})
-    assert int(dope["parameters"].replace(",", "")) > int(dopepp["parameters"].replace(",", ""))
-    assert not (tmp_path / "frame_rate.png").exists()
-    dope, dopepp = end(tmp_path, {"title": "8", "kind": "time", "labels": LABELS})
-    assert float(dope["ms/frame"]) > float(dope["network ms"]) > 0
-    assert (tmp_path / "frame_rate.png").exists()
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

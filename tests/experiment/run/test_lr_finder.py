@@ -7,7 +7,7 @@ import torch
 
 from dopepp.core.errors import RunError
 from dopepp.core.files import read_csv
-from dopepp.experiment.run.lr_finder import find_learning_rate, smooth, suggest
+from dopepp.experiment.run.lr_finder import find_learning_rate, suggest
 from dopepp.models.losses import SpatialCrossEntropy
 
 RATES = np.geomspace(1e-6, 1, 200)
@@ -34,14 +34,6 @@ def test_a_loss_that_does_not_fall_has_no_suggestion():
     assert suggest(RATES, 1 + noise) is None
     assert suggest(RATES, np.linspace(1, 3, 200)) is None
     assert suggest(RATES[:3], np.ones(3)) is None
-
-
-def test_smoothing_keeps_constants_and_lies_between_the_extremes():
-    np.testing.assert_allclose(smooth(np.full(37, 2.5)), 2.5)
-    values = np.random.default_rng(1).normal(size=100)
-    smoothed = smooth(values)
-    assert smoothed.std() < 0.5 * values.std()
-    assert values.min() < smoothed.min() < smoothed.max() < values.max()
 
 
 def test_a_sweep_ends_at_a_non_finite_loss(tiny, tmp_path, monkeypatch):

@@ -28,11 +28,6 @@ def test_stop_at_needs_verified_poses(tiny, refine):
     assert progress_of(without) == []
 
 
-def test_stop_at_is_a_share(tiny):
-    with pytest.raises(UserError, match="stop_at"):
-        tiny("stop_at=1.5")
-
-
 def test_progress_is_measured_on_whole_images(tiny, tmp_path):
     camera = tmp_path / "cam.yaml"
     camera.write_text(

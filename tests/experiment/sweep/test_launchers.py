@@ -46,20 +46,11 @@ def check_two_done_and_one_failed(folder: Path, out: str, err: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("package", "options"),
-    [
-        ("joblib", ["hydra/launcher=joblib"]),
-        (
-            "submitit",
-            [
-                "hydra/launcher=submitit_slurm",
-                "hydra.launcher.cluster=local",
-                "hydra.launcher.gpus_per_node=0",
-            ],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("package", "options"), [
+    ("joblib", ["hydra/launcher=joblib"]),
+    ("submitit", ["hydra/launcher=submitit_slurm", "hydra.launcher.cluster=local",
+                  "hydra.launcher.gpus_per_node=0"]),
+])  # fmt: skip
 def test_processes_of_this_machine(package, options, sweep, tmp_path):
     pytest.importorskip(package)
     code, out, err = sweep(*options, SWEPT, END_1="raise")

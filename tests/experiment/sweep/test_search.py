@@ -15,7 +15,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.sweep.optuna_search import examples, overrides, read_space, search_overrides
+from dopepp.experiment.sweep.optuna_search import examples, overrides, read_space
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +63,6 @@ def test_examples_cover_every_choice(loader):
 def test_entries_that_are_no_sweep_are_rejected(bad, loader):
     with pytest.raises(UserError, match=r"search\.space with .*allowed: interval\(low, high\)"):
         read_space(loader, [bad], [])
-
-
-def test_overrides_have_four_significant_digits():
-    written = search_overrides({"lr": 1.23456e-4, "n": 123456, "m": "cbam"})
-    assert written == ["lr=0.0001235", "n=123456", "m=cbam"]
 
 
 SEARCH = ("search=optuna", "search.study=s", "search.space=[]")
