@@ -131,7 +131,7 @@ class WebdatasetReader:
         for shard, row in self._items:
             digest.update(shard.keys[row].encode())
             digest.update(shard.spans[row, :, 1].tobytes())
-            has_infos &= bool(shard.spans[row, FIELDS.index("gt_info"), 0] >= 0)
+            has_infos &= bool(shard.spans[row, [*FIELDS].index("gt_info"), 0] >= 0)
         identity: dict[str, object] = {
             "shards": [shard.path.name for shard in self._shards],
             "members": digest.hexdigest(),
