@@ -179,8 +179,7 @@ class PoseDataModule(LightningDataModule):
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-Item = Callable[[int, int], Sample]
-"""Function of epoch and index that makes a sample."""
+Item = Callable[[int, int], Sample]  # function of epoch and index that makes a sample
 
 
 class SampleDataset(Dataset[Sample | UserError]):

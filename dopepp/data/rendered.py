@@ -121,8 +121,7 @@ _TEXT_LENGTH: Final = 64
 _MAX_INSTANCES: Final = 40
 """Masks are stored as a uint8 map: 0 for the background, i + 1 for instance i."""
 
-_FILLED: Final = 1 << 32
-"""Added to a slot's CRC-32, so that only an empty slot has the checksum 0."""
+_FILLED: Final = 1 << 32  # added to a slot's CRC-32, so that only an empty slot has the checksum 0
 
 
 class CachedSource(WrappedSource):

@@ -39,9 +39,7 @@ logger = logging.getLogger(__name__)
 
 UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}  # Metres per unit of a mesh file
 SMALLEST_DIAMETER: Final = 0.005
-LARGEST_DIAMETER: Final = 5.0
-"""Metres. Other diameters nearly always mean a wrong unit."""
-
+LARGEST_DIAMETER: Final = 5.0  # metres. Other diameters nearly always mean a wrong unit
 MAX_NAME: Final = 200  # Characters; limits the text that a hostile file can print
 MAX_POINTS: Final = 100_000
 MAX_SYMMETRIES: Final = 1000

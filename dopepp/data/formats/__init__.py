@@ -30,8 +30,7 @@ from dopepp.parts.part import Part
 
 T = TypeVar("T")
 
-STAGING: Final = ".items"
-"""Folder of staged items; readers skip hidden names."""
+STAGING: Final = ".items"  # folder of staged items; readers skip hidden names
 
 RECORD_FILE: Final = "_dopepp_render.json"
 """A render job's record. The underscore marks a settings file, so NDDS readers skip it."""

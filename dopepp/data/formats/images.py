@@ -21,8 +21,7 @@ from dopepp.data.formats.problems import STRICT, Node, mapping
 from dopepp.drawing import pictures
 from dopepp.drawing.pictures import DepthMap, Mask, RGBImage, Shape
 
-FORMATS: Final = ("PNG", "JPEG", "TIFF")
-"""Formats of BOP's images."""
+FORMATS: Final = ("PNG", "JPEG", "TIFF")  # formats of BOP's images
 
 COLOUR_MODES: Final = ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr")
 """Pillow's pixel types of BOP's colour and grey images."""

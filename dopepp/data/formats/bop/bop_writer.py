@@ -43,8 +43,7 @@ from dopepp.virtual.renderers.raster import Silhouette, silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
-IMAGES_A_SCENE: Final = 1000
-"""Number of images in a scene, as in the rendered training sets of BOP."""
+IMAGES_A_SCENE: Final = 1000  # number of images in a scene, as in the rendered training sets of BOP
 
 SCENE_FIELDS: Final = ("gt", "gt_info", "camera")
 """Fields of a staged item, each for a file ``scene_FIELD.json``. The cameras list the finalized

@@ -30,14 +30,12 @@ OBJECT_SETTINGS: Final = "_object_settings.json"
 CAMERA_SETTINGS: Final = "_camera_settings.json"
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 
-MAX_ITEM_BYTES: Final = 16_000_000
-"""Largest annotation file; a hundred objects take 0.5 MB."""
+MAX_ITEM_BYTES: Final = 16_000_000  # largest annotation file; a hundred objects take 0.5 MB
 
 DEPTH_UNIT: Final = 0.0001
 """Metres per value of a 16-bit ``.depth.png`` of FAT and of the writer; 0 is unknown."""
 
-_NORM_TOLERANCE: Final = 0.1
-"""Allowed deviation of a quaternion's norm from 1."""
+_NORM_TOLERANCE: Final = 0.1  # allowed deviation of a quaternion's norm from 1
 
 Objects = list[tuple[Node, Mapping[str, Any], str]]
 """(node, JSON object, class name) of every object of an annotation."""

@@ -147,8 +147,7 @@ MAX_ERROR_PX: Final = 5.0
 _MAX_SHARE: Final = 0.05
 """Allowed reprojection error of an instance as a share of its cuboid's longer side."""
 
-_MIN_FITTING: Final = 0.75
-"""Share of the instances that must fit; the others may be damaged."""
+_MIN_FITTING: Final = 0.75  # share of the instances that must fit; the others may be damaged
 
 _MIN_RATIO: Final = 3.0
 """Factor by which the error of any convention with other poses must be larger."""

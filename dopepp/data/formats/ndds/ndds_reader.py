@@ -26,14 +26,12 @@ from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
 
-_FAT_SUFFIX: Final = "_16k"
-"""Suffix of class names in FAT, e.g. ``003_cracker_box_16k``."""
+_FAT_SUFFIX: Final = "_16k"  # suffix of class names in FAT, e.g. ``003_cracker_box_16k``
 
 _MAX_OBSERVATIONS: Final = 60
 """Instances, evenly spread over the items, that determine the convention."""
 
-_MAX_COUNTED_ITEMS: Final = 1000
-"""Reading this many annotations takes about a second."""
+_MAX_COUNTED_ITEMS: Final = 1000  # reading this many annotations takes about a second
 
 
 class NddsReader:

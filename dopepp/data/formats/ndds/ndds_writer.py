@@ -32,8 +32,7 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
 
-CM: Final = 100.0
-"""Centimetres per metre."""
+CM: Final = 100.0  # centimetres per metre
 
 UNREAL_AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """P of ``pose_transform``, from the readme of Falling Things."""

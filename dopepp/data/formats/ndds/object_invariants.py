@@ -34,8 +34,7 @@ PROJECTION_PX: Final = 2.0
 PROJECTION_SHARE: Final = 0.02
 """Allowed error of a stated projection: pixels, plus a share of the cuboid's longer side."""
 
-ORIENTATION_RAD: Final = np.deg2rad(2.0)
-"""Allowed angle between two statements of an orientation."""
+ORIENTATION_RAD: Final = np.deg2rad(2.0)  # allowed angle between two statements of an orientation
 
 MATRIX_TOLERANCE: Final = 5e-3
 NORM_TOLERANCE: Final = 0.01
@@ -44,8 +43,7 @@ NORM_TOLERANCE: Final = 0.01
 EDGE_SHARE: Final = 0.02
 """Allowed inequality and slant of edges, as a share of the longest; a thinner box is flat."""
 
-SIZE_SHARE: Final = 0.05
-"""Allowed difference of edges from the class's ``cuboid_dimensions``."""
+SIZE_SHARE: Final = 0.05  # allowed difference of edges from the class's ``cuboid_dimensions``
 
 _EDGES: Final = np.array(
     [

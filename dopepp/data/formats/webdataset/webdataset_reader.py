@@ -35,11 +35,8 @@ from dopepp.parts.part import Part
 _log = logging.getLogger(__name__)
 
 MAX_SHARDS: Final = 100_000
-MAX_SHARD_BYTES: Final = 20_000_000_000
-"""Largest shard to download; BOP's have about 1 GB."""
-
-_MAX_TEXT: Final = 4000
-"""Characters of a path; Python parses no number with more digits."""
+MAX_SHARD_BYTES: Final = 20_000_000_000  # largest shard to download; BOP's have about 1 GB
+_MAX_TEXT: Final = 4000  # characters of a path; Python parses no number with more digits
 
 _MAX_BRACES: Final = 10
 _PIECE_BYTES: Final = 1 << 20

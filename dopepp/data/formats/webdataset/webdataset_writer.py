@@ -30,11 +30,8 @@ from dopepp.data.formats.images import encode_png, encode_runs
 from dopepp.data.formats.webdataset import KEY_FILE, TarMember, members, read_span
 from dopepp.data.sample import Sample
 
-_OWNER: Final = "dopepp"
-"""A fixed owner and a modification time of 0 give equal images equal bytes."""
-
-Content = dict[str, bytes]
-"""An image's members by extension."""
+_OWNER: Final = "dopepp"  # A fixed owner and a modification time of 0 give equal images equal bytes
+Content = dict[str, bytes]  # an image's members by extension
 
 
 class WebdatasetWriter(BopFolder):

@@ -25,8 +25,7 @@ from dopepp.virtual.backgrounds import Backgrounds
 
 _log = logging.getLogger(__name__)
 
-_MAX_COUNTED_FRAMES: Final = 1000
-"""Reading this many meta.mat files takes about a second."""
+_MAX_COUNTED_FRAMES: Final = 1000  # reading this many meta.mat files takes about a second
 
 _FIRST_SCENE_OF_SECOND_CAMERA: Final = 60
 _CAMERAS: Final = (
