@@ -82,7 +82,6 @@ def config_folders() -> Iterator[tuple[str, Path]]:
 
 
 def _enabled() -> list[str]:
-    """Return the names of the enabled packages from the environment variable."""
     return [name for name in os.environ.get(VARIABLE, "").split(",") if name]
 
 

@@ -51,7 +51,6 @@ def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
 
 
 def _encode(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
-    """Return an RGB image encoded in the format of a suffix, e.g. ``.png``."""
     import cv2  # takes a tenth of a second, and not every command writes images
 
     return bytes(cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())

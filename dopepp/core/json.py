@@ -104,7 +104,6 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _finite(text: str) -> float:
-    """Convert a number's text to a float; raise :class:`_NotFiniteError` if it is not finite."""
     number = float(text)
     if not math.isfinite(number):
         raise _NotFiniteError(text)

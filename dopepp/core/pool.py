@@ -210,7 +210,6 @@ class ProcessPool(Pool):
         return self._threads.submit(self._apply, item)
 
     def _apply(self, item: object) -> Any:
-        """Apply the function to an item in this thread's worker process, started if needed."""
         worker = self._worker
         is_new = worker.process is None
         process = worker.process = worker.process or self._start()
@@ -230,7 +229,6 @@ class ProcessPool(Pool):
         return unpickle_answer(answer)
 
     def _start(self) -> SpawnProcess:
-        """Start this thread's worker process and connect to it."""
         context = get_context("spawn")
         self._worker.connection, remote = context.Pipe()
         process = context.Process(target=_serve, args=(remote,))

@@ -76,7 +76,6 @@ class Range:
 
     @property
     def _unit(self) -> str:
-        """Return the unit in parentheses, or an empty string."""
         return f" ({self.unit})" if self.unit else ""
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -240,7 +239,6 @@ def _validate(kind: Any, value: object, name: str) -> Any:
 
 
 def _json(value: object, name: str) -> str:
-    """Return a value as JSON text; raise a UserError if JSON cannot represent the value."""
     try:
         return json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -294,7 +292,6 @@ def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
 
 
 def _cause(detail: ErrorDetails) -> UserError | None:
-    """Return the UserError that a dataclass raised in ``__post_init__``, or None."""
     cause = detail.get("ctx", {}).get("error")
     return cause if isinstance(cause, UserError) else None
 

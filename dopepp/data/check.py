@@ -59,7 +59,6 @@ def check_dataset(root: Path) -> CheckReport:
 
 
 def _layout_of(root: Path) -> str | None:
-    """Return the first key of :data:`LAYOUTS` that fits a folder, or None."""
     return next((name for name, (is_layout, _) in LAYOUTS.items() if is_layout(root)), None)
 
 

@@ -121,7 +121,6 @@ class PoseDataModule(LightningDataModule):
         return self._loader(SampleDataset(self.val_item, len(self.val_source)), shuffle=False)
 
     def _loader(self, dataset: SampleDataset, shuffle: bool) -> PoseLoader:
-        """Return the loader of this process's share of a data set."""
         rank = self.trainer.global_rank if self.trainer is not None else 0
         world_size = self.trainer.world_size if self.trainer is not None else 1
         return PoseLoader(

@@ -112,7 +112,6 @@ class HybridSource:
         return role, cycle, int(self._order(role, cycle, length)[rank])
 
     def _make_plan(self, epoch: int) -> tuple[Order, Order]:
-        """Return each item's source and its rank from 0 among the epoch's items of that source."""
         roles = np.repeat(np.arange(len(_ROLES)), self.counts)
         roles = item_rng(self._seed, Purpose.MIX, epoch).permutation(roles)
         ranks = np.empty_like(roles)

@@ -104,7 +104,6 @@ def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) ->
 
 
 def _read_symmetries(choice: str) -> dict[str, bop_models.Symmetries]:
-    """Return the symmetries (metres) in the file ``choice``, by part name."""
     path = Path(choice)
     if not path.is_file():
         allowed = f"null, {NONE}, {AUTO} or a models_info.json"

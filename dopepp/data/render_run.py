@@ -198,7 +198,6 @@ class RenderTasks:
 
     @cached_property
     def _writer(self) -> Writer:
-        """Writer of this process for the images of the data set."""
         cv2.setNumThreads(1)
         os.environ.setdefault(THREADS_SETTING, "1")
         if not is_claimed(self._root):
@@ -262,8 +261,6 @@ def render_dataset(
 
 
 class _Run:
-    """Remaining tasks of a rendering run, and the report of finished tasks."""
-
     def __init__(self, chunks: list[Chunk], report: RenderReport) -> None:
         self.report = report
         self._chunks = {chunk.number: chunk for chunk in chunks}

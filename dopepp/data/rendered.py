@@ -204,14 +204,12 @@ class CachedSource(WrappedSource):
             raise UserError(problem, "a folder with at least this much free space", fix) from error
 
     def _resized(self, index: int) -> Sample:
-        """Return an item resized to fit ``input_size``, without depth; unchanged without a size."""
         sample = self._source.sample(index, 0)
         if self._input_size is None:
             return sample
         return replace(resize_sample(sample, self._input_size), depth=None)
 
     def _checksum(self, index: int) -> int:
-        """Return a checksum of a slot that is never 0, the value of an empty slot."""
         return zlib.crc32(self._slots[index : index + 1].view("u1").data) | _FILLED
 
     def _store(self, index: int, sample: Sample) -> None:
@@ -267,7 +265,6 @@ class CachedSource(WrappedSource):
 
 
 def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
-    """Return the dtype of a slot: one sample with an image of ``shape``."""
     instance = np.dtype(
         [
             ("T_cam_obj", "f8", (4, 4)),

@@ -66,7 +66,6 @@ def mirror_distance(mesh: Mesh) -> float:
 
 
 def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:
-    """Yield the kind and the mesh of each look-alike."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     if mirror_distance(mesh) > _OWN_MIRROR:
         mirrored = mesh.vertices * (-1.0, 1.0, 1.0)

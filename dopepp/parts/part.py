@@ -213,8 +213,6 @@ class _MeshRecord:
 
 @dataclass(frozen=True)
 class _Record:
-    """Fields of a :class:`Part` as JSON values."""
-
     __pydantic_config__ = STRICT
     name: str
     cuboid: Annotated[list[_Point], Field(min_length=9, max_length=9)]

@@ -275,7 +275,6 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
 
 
 def _across(axis: Vector) -> Vector:
-    """Return a unit vector perpendicular to an axis, a coordinate axis if possible."""
     nearest = np.eye(3)[np.abs(axis).argmin()]
     across = nearest - (nearest @ axis) * axis
     return np.asarray(across / np.linalg.norm(across))

@@ -189,7 +189,6 @@ def _retry(act: Callable[[], T]) -> T:
 
 
 def _is_open_file(descriptor: int, path: Path) -> bool:
-    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -109,7 +109,6 @@ class BackgroundCrops:
 
 
 def _windows(integral: np.ndarray, size: Shape) -> np.ndarray:
-    """Return the sums in all windows of (height, width) from an integral image."""
     height, width = size
     return np.asarray(
         integral[height:, width:]
@@ -226,6 +225,5 @@ class RandomMask(Checked):
 
 
 def _middle_slice(patch: slice, length: int) -> slice:
-    """Return the ``length`` middle rows or columns of a patch."""
     start = patch.start + (patch.stop - patch.start - length) // 2
     return slice(start, start + length)

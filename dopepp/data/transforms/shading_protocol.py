@@ -84,7 +84,6 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
 
 
 def _can_be_shaded(instance: Instance) -> bool:
-    """Return whether an instance has a mask with a visible pixel."""
     return instance.mask is not None and bool(instance.mask.any())
 
 

@@ -80,7 +80,6 @@ def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
 
 
 def _read_pieces(path: Path) -> tuple[Piece, ...]:
-    """Read the vertices of convex pieces (metres) from a cached ``.npz`` file."""
     try:
         with np.load(path, allow_pickle=False) as content:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]

@@ -125,7 +125,6 @@ def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
 
 
 def _farthest(sources: Float[np.ndarray, "sources 3"], points: Points) -> tuple[float, int]:
-    """Return the largest distance from a source to a point, and the index of that point."""
     best, end = -1.0, 0
     # 512 rows at a time keep the distances of a 100,000-vertex hull under 0.5 GB.
     for start in range(0, len(sources), 512):

@@ -108,7 +108,6 @@ def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
 def _means(
     values: Float[np.ndarray, "values width"], owners: Int[np.ndarray, " values"]
 ) -> Float[np.ndarray, "owners width"]:
-    """Return the mean of each owner's values; ``owners`` holds the index of each value's owner."""
     counts = np.maximum(np.bincount(owners), 1)
     sums = [np.bincount(owners, column) for column in values.T]
     return np.stack(sums, axis=1) / counts[:, None]

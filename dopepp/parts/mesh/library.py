@@ -190,7 +190,6 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _packed(header: dict[str, Any], binary: bytes) -> bytes:
-    """Return the bytes of a GLB file with a JSON header and a binary chunk."""
     text = json.dumps(header).encode()
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary

@@ -169,7 +169,6 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file with LF line ends; file names in any encoding remain intact."""
     return path.read_bytes().decode("utf-8", "surrogateescape").replace("\r\n", "\n")
 
 

@@ -129,7 +129,6 @@ def ycb_part(root: str | Path, name: str) -> Part:
 
 
 def _read_points(path: Path) -> Points:
-    """Read a text file of points, with x, y and z in each line."""
     allowed = "lines of three finite numbers"
     try:
         if path.stat().st_size > MAX_POINTS_BYTES:
@@ -182,7 +181,6 @@ def _clean_mesh(path: Path, raw: RawMesh) -> Mesh:
 
 
 def _damage_error(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
-    """Return the error for a mesh file that is damaged or too large."""
     content = "triangles, finite coordinates and colours of their range"
     allowed = f"a complete mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
     return UserError(f"mesh {path} with {problem}", allowed, fix)

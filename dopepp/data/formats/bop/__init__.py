@@ -307,6 +307,5 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
 
 
 def _relative_files(folder: Path, kind: Kind, images: Sequence[int]) -> list[str]:
-    """Return each image's path relative to the scene folder; empty if the file is missing."""
     files = image_files(folder, kind)
     return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]

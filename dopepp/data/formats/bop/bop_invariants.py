@@ -151,7 +151,6 @@ class _SceneCheck:
 
 
 def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
-    """Return the paths of the masks in a folder by image number and object index."""
     files: dict[int, dict[int, Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         image, _, number = path.stem.partition("_")
@@ -299,7 +298,6 @@ def check_image(
 def _check_camera(
     nodes: Nodes, camera: object, shape: Shape | None, has_depth: bool
 ) -> CameraMatrix | None:
-    """Check an image's camera record; return K, or None if K is missing or implausible."""
     node = nodes("camera", 0)
     K: CameraMatrix = bop.read_cameras([camera], nodes)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):

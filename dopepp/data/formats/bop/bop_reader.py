@@ -106,7 +106,6 @@ class BopReader:
         self._log_deviations(with_model)
 
     def _find_items(self) -> list[tuple[BopScene, int]]:
-        """Return the scene, and the row in the scene, of each selected image on disk, in order."""
         listed = [
             (scene, row)
             for scene in self._scenes
@@ -195,7 +194,6 @@ class BopReader:
         return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
     def _depth(self, scene: BopScene, row: int, shape: Shape) -> DepthMap | None:
-        """Read an image's depth in metres; None in a scene without depth images."""
         if not any(scene.depth_files):
             return None
         expected = f"depth/{scene.image_ids[row]:06d}.png"

@@ -160,7 +160,6 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
 
 
 def _check_repeats(path: Path, table: Table) -> None:
-    """Raise a UserError if two lines differ only in the time."""
     keys = table[:, 1:17]
     order = np.lexsort(keys.T[::-1])  # stable: equal rows keep the order of lines
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
@@ -172,7 +171,6 @@ def _check_repeats(path: Path, table: Table) -> None:
 
 
 def _check_unit(path: Path, table: Table) -> None:
-    """Raise a UserError if the median distance from the camera is implausible in millimetres."""
     if not len(table):
         return
     distances = np.linalg.norm(table[:, 14:17], axis=1)

@@ -75,7 +75,6 @@ class BopFolder:
 
     @cached_property
     def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
-        """Each part and its surface by name, for parts with a mesh."""
         return {part.name: (part, make_surface(part.mesh)) for part in self._parts if part.mesh}
 
     def labels(self, sample: Sample) -> Labels:

@@ -158,7 +158,6 @@ class NddsSettings:
         return self._files[path]
 
     def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
-        """Return the path and content of settings in the annotation's folder, or in the root."""
         for path in (annotation.with_name(name), self._root / name):
             content = self.read(path)
             if content is not None:
@@ -230,7 +229,6 @@ class NddsSettings:
         return {str(name) for name in listed} if isinstance(listed, list) else None
 
     def _objects(self, annotation: Path, label: str) -> list[dict[str, Any]]:
-        """Return the entries of a class in ``_object_settings.json``."""
         entries = _entries(self._of(annotation, OBJECT_SETTINGS)[1], "exported_objects")
         return [entry for entry in entries if entry.get("class") == label]
 
@@ -244,13 +242,11 @@ class NddsSettings:
 
 
 def _entries(settings: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    """Return the objects in a list of a settings file; empty if the list is missing."""
     rows = settings.get(name)
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
 def _intrinsics(values: Mapping[str, Any], node: Node) -> CameraMatrix:
-    """Return K from ``fx``, ``fy``, ``cx`` and ``cy`` in pixels; NaN if a number is missing."""
     return camera_matrix(*node.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
 
 

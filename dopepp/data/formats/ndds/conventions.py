@@ -238,7 +238,6 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
 
 
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
-    """Return whether two conventions' poses agree, up to ``_SAME_POSE``, on most instances."""
     distances = []
     for observation in observations:
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part
@@ -257,7 +256,6 @@ def _quantile(values: Sequence[float]) -> float:
 def _undecidable(
     where: str, reason: str, listed: Sequence[PoseConvention], errors: dict[PoseConvention, float]
 ) -> UserError:
-    """Return the error for a data set whose annotations fit none or several conventions."""
     figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in listed)
     return UserError(
         f"{where}: {reason}; reprojection error: {figures}",

@@ -133,7 +133,6 @@ def _check_camera(
 
 
 def _check_ids(node: Node, objects: Objects) -> set[int]:
-    """Report ids shared by two objects of an annotation; return the set of ``segmentation_id``."""
     for name in ("instance_id", "segmentation_id"):
         stated = [item.get(name) for _, item, _ in objects]
         ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none

@@ -81,7 +81,6 @@ class NddsReader:
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
 
     def _find_convention(self, items: Sequence[Path]) -> NddsFinding:
-        """Determine the convention of the poses from evenly spread items."""
         visible: list[Observation] = []
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
@@ -105,7 +104,6 @@ class NddsReader:
         return conventions.find_convention(visible or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
-        """Return the part of a class name in the files (see the reader's ``parts``), or None."""
         label = self._classes.get(label, label)
         if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
             label = label[: -len(_FAT_SUFFIX)]
@@ -153,7 +151,6 @@ class NddsReader:
         return Sample(image, K, instances, depth, self.name, self._key(path))
 
     def _key(self, path: Path) -> str:
-        """Return an annotation's path relative to the data set's folder, without suffix."""
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
     def _is_out_of_view(self, observation: Observation) -> bool:
@@ -209,7 +206,6 @@ class NddsReader:
 
 
 def _find_items(folder: Path) -> list[Path]:
-    """Return the annotation files with an image; log the number of others."""
     items, without_image = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
         counts = f"({len(without_image)} JSON files without an image)"

@@ -223,7 +223,6 @@ class ObjectCheck:
                     self._node[name].report(message)
 
     def _check_bounding_box(self, visible_box: Box | None) -> None:
-        """Report a ``bounding_box`` that is inverted or does not contain the visible pixels."""
         entry = mapping(self._item.get("bounding_box"))
         if not entry:
             return
@@ -276,7 +275,6 @@ class ObjectCheck:
         return False
 
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
-        """Report annotated projections that differ from those of ``cuboid`` (camera frame)."""
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
             return  # projections of an object partly behind the camera are meaningless
@@ -293,7 +291,6 @@ class ObjectCheck:
 
 
 def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
-    """Return an array, or None if a number is missing or not finite."""
     return values if values is not None and np.isfinite(values).all() else None
 
 

@@ -180,7 +180,6 @@ def _leads_out(info: tarfile.TarInfo) -> bool:
 
 
 def _problem(info: tarfile.TarInfo, archive_size: int) -> str:
-    """Return why a member of an archive (size in bytes) is rejected, or an empty string."""
     key, dot, _ = PurePosixPath(info.name).name.partition(".")
     if _leads_out(info):
         return "which leads out of the archive"

@@ -162,7 +162,6 @@ class ShardRecords:
         return member if record_kind == "camera" else member[number]
 
     def _json(self, name: str) -> Any:
-        """Return a JSON member's content; None if it is missing, too large or no JSON."""
         content, member = self._read(name), self._member(name)
         if content is None or len(content) <= MAX_BYTES:
             return None if content is None else member.decode(content)
@@ -199,7 +198,6 @@ def _records(shard: ShardIndex, image: int) -> ShardRecords:
 
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:
-    """Raise a UserError if two shards contain the same key."""
     shard_of: dict[str, Path] = {}
     for shard in shards:
         if repeated := [key for key in shard.keys if key in shard_of]:
@@ -259,7 +257,6 @@ def _expand_braces(text: str) -> list[str]:
 
 
 def _local_shards(path: Path) -> list[Path]:
-    """Return the shard at a path, or all shards in a folder."""
     if path.is_file():
         return [path]
     shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))

@@ -93,7 +93,6 @@ class WebdatasetWriter(BopFolder):
             partial.unlink(missing_ok=True)
 
     def _write_keys(self, chunk: int) -> None:
-        """Add the shard's keys to ``key_to_shard.json``."""
         if not self._shard(chunk).exists():
             return
         path = self.root / self.split / KEY_FILE
@@ -145,5 +144,4 @@ def _add_image(archive: tarfile.TarFile, key: str, content: Content) -> None:
 
 
 def _image_number(key: str) -> int:
-    """Return the number of the image in its shard, from a key ``SHARD_IMAGE``."""
     return int(key.rpartition("_")[2])

@@ -76,7 +76,6 @@ class _FrameCheck:
         self._report, self._classes, self._size = report, classes, cache(self._read_size)
 
     def _read_size(self, name: str) -> tuple[Points, float] | None:
-        """Return an object's points and diameter in metres; None without readable points."""
         path = self._report.root / "models" / name / "points.xyz"
         if not path.is_file():
             self._report.note(f"models/{name}/points.xyz is missing: its boxes are not checked")

@@ -124,7 +124,6 @@ class YcbVideoReader:
         return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
 
     def _start(self, frame: str) -> str:
-        """Return the common start of the paths of a frame's files, ``ROOT/data/0050/000003``."""
         return str(self.root / ycb_video.FOLDERS[self.subset] / frame)
 
     def _meta(self, frame: str) -> FrameMeta:
