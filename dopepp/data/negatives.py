@@ -54,13 +54,7 @@ class PhotoFrames:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``; the epoch is ignored.
-
-        Raises:
-            IndexError: The index is negative, or not below the number of frames.
-        """
-        if not 0 <= index < self._length:
-            raise IndexError(f"index {index} is out of range for {self._length} frames")
+        """Return frame ``index``; the epoch is ignored."""
         round_number, number = divmod(index, len(self._order))
         rng = item_rng(self._seed, Purpose.WINDOW, round_number, number)
         share = 1.0 if round_number < 2 else rng.uniform(0.5, 1.0)
@@ -99,11 +93,7 @@ class UnlabelledRenders(WrappedSource):
 
 
 class FrameMix:
-    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n.
-
-    Args:
-        sources: Each has at least ``num_frames / len(sources)`` frames, rounded up.
-    """
+    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n."""
 
     def __init__(
         self, sources: Sequence[DescribedSource], num_frames: int, name: str = "negatives"
@@ -114,13 +104,7 @@ class FrameMix:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``.
-
-        Raises:
-            IndexError: The index is negative, or not below the number of frames.
-        """
-        if not 0 <= index < self._length:
-            raise IndexError(f"index {index} is out of range for {self._length} frames")
+        """Return frame ``index``."""
         item, source = divmod(index, len(self.sources))
         return self.sources[source].sample(item, epoch)
 

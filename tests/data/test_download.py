@@ -71,9 +71,7 @@ def get(server, tmp_path, monkeypatch):
         digest = hashlib.sha256(server.content).hexdigest()
         facts = len(server.content), digest, PurePosixPath("set/photos"), "free for tests"
         address = address or f"http://127.0.0.1:{server.server_port}"
-        monkeypatch.setitem(
-            downloads.SOURCES, "tiny", DownloadSource(f"{address}/{kind}", *facts)
-        )
+        monkeypatch.setitem(downloads.SOURCES, "tiny", DownloadSource(f"{address}/{kind}", *facts))
         return download("tiny", folder, **options)
 
     return get

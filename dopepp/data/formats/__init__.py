@@ -73,17 +73,14 @@ class Writer(Protocol):
 
 
 def share_slice(num_items: int, part_of: tuple[float, float], name: str) -> slice:
-    """Return the slice of ``num_items`` items between two fractions (first, last) in [0, 1].
+    """Return the slice of ``num_items`` items between two ascending fractions in [0, 1].
 
     Equal bounds are rounded equally, so adjacent shares neither overlap nor leave a gap.
 
     Raises:
         UserError: The share has no item.
-        ValueError: The fractions do not ascend within [0, 1].
     """
     first, last = part_of
-    if not 0 <= first < last <= 1:
-        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
     part = slice(round(first * num_items), round(last * num_items))
     if part.start == part.stop:
         problem = f"{name}: no image in the fraction {first:.3g} – {last:.3g} of {num_items} images"
@@ -122,11 +119,8 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
-        problem, allowed = (
-            f"{path}, which is not a JSON object",
-            "a file written by `dopepp render`",
-        )
-        raise UserError(problem, allowed, "restore the file from backup, or choose another folder")
+        fix = "restore the file from backup, or choose another folder"
+        raise UserError(f"{path}, which is no JSON object", "a file of `dopepp render`", fix)
     return content
 
 
@@ -143,10 +137,9 @@ def stage_item(path: Path, content: bytes) -> None:
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
     """Return the staged files ``NUMBER*SUFFIX`` in order; none if the folder is missing."""
-    try:
+    with suppress(FileNotFoundError):
         return sorted(staging.glob(f"[0-9]*{suffix}"))
-    except FileNotFoundError:
-        return []
+    return []
 
 
 @contextmanager

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -84,27 +83,17 @@ def header_shape(file: Path | io.BytesIO) -> Shape | None:
 
 
 def decode_rgb(content: bytes, where: str) -> RGBImage:
-    """Decode a colour or grey image as RGB, without an alpha channel.
-
-    Raises:
-        UserError: The image is not a PNG, JPEG or TIFF of 8 bits, is damaged, or too large.
-    """
+    """Decode a colour or grey image of 8 bits as RGB; another image is a UserError."""
     image = decode_image(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
     return np.array(image.convert("RGB"))
 
 
 def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -> DepthMap:
-    """Decode a depth image as metres, float32; 0 is unknown.
-
-    Args:
-        content: Bytes of the image file.
-        where: Name of the image in messages.
-        depth_scale: Millimetres per unit; NaN if not stated.
-        shape: (height, width) of the colour image.
+    """Decode a depth image of ``depth_scale`` mm per unit as metres, float32; 0 is unknown.
 
     Raises:
-        UserError: The image is damaged, too large, of another size or type, or has no scale.
+        UserError: The image is damaged, too large, of another size or type, or the scale is NaN.
     """
     node = Node(STRICT, where)
     units = decode_one_channel(node, shape, content, DEPTH_MODES)
@@ -116,11 +105,7 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
 
 
 def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
-    """Decode a mask of an image of ``shape`` (height, width); the object's pixels are not 0.
-
-    Raises:
-        UserError: The mask is damaged, too large, of another size, or has several channels.
-    """
+    """Decode a mask of ``shape``; the object's pixels are not 0. Other images raise a UserError."""
     mask = decode_one_channel(Node(STRICT, where), shape, content)
     assert mask is not None
     return np.asarray(mask != 0)
@@ -150,10 +135,8 @@ def decode_one_channel(
 def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
     """Read a map (depth, labels) of YCB-Video, NDDS or FAT; report an invalid map and return None.
 
-    Args:
-        node: The file.
-        shape: Expected (height, width); None to allow any shape.
-        colour: Whether a colour image, whose meaning is unknown, gives None without a report.
+    ``shape`` is the expected (height, width), or None for any. With ``colour``, a colour image,
+    whose meaning is unknown, gives None without a report.
     """
     image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
@@ -176,13 +159,6 @@ def check_one_channel(
         node["size"].report(problem, f"{shape[1]}×{shape[0]}, the colour image's size")
         return None
     return image
-
-
-def encode_png(pixels: NDArray[Any]) -> bytes:
-    """Encode an RGB (uint8) or one-channel (uint8, uint16) image as PNG."""
-    if pixels.ndim == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".png", pixels)[1])
 
 
 def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:

@@ -28,13 +28,11 @@ from dopepp.data.transforms.masking import (
 )
 from dopepp.drawing.pictures import Mask, RGBImage
 
-TOLERANCE: Final = 0.02  # Allowed difference of the covered share from the requested share.
+TOLERANCE: Final = 0.02  # allowed difference of the covered share from the requested share
 _SIDES: Final = (0.15, 0.5)
 """Range of a patch's sides as shares of the sides of the object's box, so several patches fit."""
 
-_MAX_PATCHES: Final = 300
-"""More patches would be tiny, as the background has no room for larger crops."""
-
+_MAX_PATCHES: Final = 300  # more would be tiny, as the background has no room for larger crops
 _NEVER: Final = np.iinfo(np.int32).max
 
 
@@ -61,12 +59,7 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
         shares: Shares of each instance's visible pixels to cover, in [0, 1], one per result.
         seed: Seed of the patches, which are crops of the image's background.
         index: Index of the image in the test set; the patches also depend on it.
-
-    Raises:
-        ValueError: A share is outside [0, 1].
     """
-    if not all(0 <= share <= 1 for share in shares):
-        raise ValueError(f"shares must be in [0, 1], got {list(shares)}")
     shape = sample.image.shape[:2]
     silhouettes = [silhouette(instance, shape) for instance in sample.instances]
     crops = BackgroundCrops(sample.image, silhouettes)

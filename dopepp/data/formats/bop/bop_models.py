@@ -20,9 +20,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_file
+from dopepp.core.files import encode_image, write_file
 from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number
-from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.geometry.rotation import is_rotation, nearest_rotation
@@ -280,7 +279,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
         assert part.mesh is not None
         write_file(model, ply_bytes(part.mesh, texture.name))
         if part.mesh.texture is not None:
-            write_file(texture, encode_png(part.mesh.texture))
+            write_file(texture, encode_image(part.mesh.texture))
     write_file(path, content)
 
 

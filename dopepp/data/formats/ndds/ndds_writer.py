@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Float, Integer
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_file
+from dopepp.core.files import encode_image, write_file
 from dopepp.core.json import read_json
-from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import Box
 from dopepp.data.formats.ndds import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
 from dopepp.data.sample import Instance, Sample
@@ -107,7 +106,7 @@ class NddsWriter:
             steps[(steps < 0) | (steps > np.iinfo(np.uint16).max)] = 0
             images[".depth.png"] = steps.astype(np.uint16)
         for suffix, image in images.items():
-            write_file(self._path(index, suffix), encode_png(image))
+            write_file(self._path(index, suffix), encode_image(image))
         write_file(self._path(index, ".json"), _encode(record))
 
     def _path(self, index: int, suffix: str) -> Path:
