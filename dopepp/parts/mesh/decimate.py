@@ -34,11 +34,8 @@ def decimate(
 ]:
     """Replace triangles by at most ``max_faces`` larger triangles.
 
-    Args:
-        vertices: Positions.
-        faces: Triangles, all with an area.
-        values: Texture coordinates or colours, which remain separate at seams, or None.
-        max_faces: Largest number of triangles.
+    All ``faces`` must have an area. ``values`` are texture coordinates or colours, which remain
+    separate at seams.
 
     Returns:
         New vertices, faces and values, and the largest distance that a vertex moved.
@@ -99,10 +96,7 @@ def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
     # Each triangle starts at its lowest corner, so that equal triangles compare equal.
     shift = np.where((b < a) & (b < c), 1, np.where((c < a) & (c < b), 2, 0))[:, None]
     ordered = np.take_along_axis(corners[candidates], (shift + np.arange(3)) % 3, axis=1)
-    order = np.lexsort(ordered.T)
-    new = np.ones(len(order), bool)
-    new[1:] = (np.diff(ordered[order], axis=0) != 0).any(axis=1)
-    return np.sort(candidates[order[new]])
+    return np.sort(candidates[np.unique(ordered, axis=0, return_index=True)[1]])
 
 
 def _means(

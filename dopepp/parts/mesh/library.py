@@ -241,9 +241,7 @@ def _image_number(header: dict[str, Any], primitive: dict[str, Any]) -> int | No
 def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     """Read a file's content with trimesh, which cannot access other files without a path.
 
-    Args:
-        data: Content of the file.
-        kind: Suffix of the format, without the dot.
+    ``kind`` is the suffix of the format, without the dot.
 
     Returns:
         The merged meshes, with trimesh's name of the unit, and the number of meshes.

@@ -24,8 +24,7 @@ from dopepp.drawing.pictures import FORMATS, MAX_SIDE, RGBImage, read_picture
 from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
 MAX_OFF_BYTES: Final = 50_000_000  # size of an OFF file; parsing needs 15 times as much
-MAX_MATERIAL_BYTES: Final = 10_000_000
-"""Largest material file (a hundred thousand materials); bounds memory."""
+MAX_MATERIAL_BYTES: Final = 10_000_000  # a hundred thousand materials; bounds memory
 
 NO_COORDINATE: Final = -1  # Texture coordinate index of a corner without coordinates
 
@@ -237,10 +236,8 @@ def fans(
 ) -> Int[np.ndarray, "triangles 3"]:
     """Triangulate polygons as fans around their first corners.
 
-    Args:
-        vertices: Positions.
-        corners: Vertex index of each corner, polygon by polygon; not checked here.
-        counts: Number of corners of each polygon.
+    ``corners`` are the vertex indices polygon by polygon, which are not checked here; ``counts``
+    are the numbers of corners of the polygons.
 
     Returns:
         Triangles as indices into ``corners``.

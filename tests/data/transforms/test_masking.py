@@ -349,13 +349,13 @@ def test_the_only_crops_with_contrast_are_found():
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_outside_0_to_1_is_rejected(share):
-    with pytest.raises(ValueError, match=r"shares must be in \[0, 1\]"):
+    XXX
         shade(addressed(), [0.2, share], 0, 0)
 
 
 def test_real_frames_are_shaded_to_the_share(ycb_root):
     names = ["003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle"]
     parts = [ycb_part(ycb_root, name) for name in names]
-    sample = YcbVideoReader(ycb_root, parts, frames=["0050/000003"]).sample(0)
+    sample = YcbVideoReader(ycb_root, parts, ["0050/000003"]).sample(0)
     for shaded in shade(sample, SHARES, 17, 0):
         assert shaded.reached == pytest.approx((shaded.share,) * 3, abs=0.001)
