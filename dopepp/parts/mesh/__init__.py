@@ -8,7 +8,6 @@ modules of this package read mesh files.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -146,9 +145,15 @@ def hash_triangles(vertices: Vertices, faces: Faces) -> str:
 
 def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"], Faces]:
     """Merge vertices at exactly one position; faces that become degenerate remain."""
-    # Adding 0.0 turns −0.0 into 0.0.
-    welded, index = np.unique(vertices + 0.0, axis=0, return_inverse=True)
-    return welded, index.reshape(-1)[faces]
+    # Adding 0.0 turns −0.0 into 0.0. np.unique(axis=0) would take ten times as long.
+    positions = vertices + 0.0
+    order = np.lexsort(positions.T[::-1])  # sort by x, then y, then z
+    ranked = positions[order]
+    new = np.ones(len(ranked), bool)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    index = np.empty(len(ranked), np.int64)
+    index[order] = np.cumsum(new) - 1
+    return ranked[new], index[faces]
 
 
 def connected(

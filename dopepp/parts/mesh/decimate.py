@@ -96,7 +96,10 @@ def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
     # Each triangle starts at its lowest corner, so that equal triangles compare equal.
     shift = np.where((b < a) & (b < c), 1, np.where((c < a) & (c < b), 2, 0))[:, None]
     ordered = np.take_along_axis(corners[candidates], (shift + np.arange(3)) % 3, axis=1)
-    return np.sort(candidates[np.unique(ordered, axis=0, return_index=True)[1]])
+    order = np.lexsort(ordered.T)
+    new = np.ones(len(order), bool)
+    new[1:] = (np.diff(ordered[order], axis=0) != 0).any(axis=1)
+    return np.sort(candidates[order[new]])
 
 
 def _means(

@@ -347,12 +347,6 @@ def test_the_only_crops_with_contrast_are_found():
     assert (pasted != 77).any(axis=1).sum() > 20
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_a_share_outside_0_to_1_is_rejected(share):
-    XXX
-        shade(addressed(), [0.2, share], 0, 0)
-
-
 def test_real_frames_are_shaded_to_the_share(ycb_root):
     names = ["003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle"]
     parts = [ycb_part(ycb_root, name) for name in names]
