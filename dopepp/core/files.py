@@ -1,8 +1,8 @@
 """Atomic writing of files, images and CSV, and the user's cache folder.
 
-A file is written next to its path under the name of :func:`partial_path` and then renamed. A killed
-process leaves such a partial file, which :func:`is_abandoned` detects. Files are not synced: they
-survive the death of their process, but not a power cut within seconds.
+A file is written under the name of :func:`partial_path` and then renamed. A killed process leaves
+such a partial file, which :func:`is_abandoned` detects. Files are not synced: they survive the
+death of their process, but not a power cut within seconds.
 """
 
 from __future__ import annotations

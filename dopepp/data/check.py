@@ -1,7 +1,6 @@
 """Recognise the layout of a data set's folder, and check its files and annotations for defects.
 
-To add a layout, write ``check_NAME(report)`` in the module of its invariants in
-:mod:`dopepp.data.formats`, and a line in ``LAYOUTS``.
+To add a layout, write ``check_NAME(report)`` in :mod:`dopepp.data.formats`, and a line below.
 """
 
 from __future__ import annotations

@@ -131,11 +131,8 @@ class WindowedSource(WrappedSource):
 
     Networks that train on windows of renders need windows of photographs too. Each epoch samples
     object and window again, uniformly among the windows that contain the object's centre, or among
-    all windows without an object. Smaller images are padded, as for prediction.
-
-    Args:
-        image: (width, height) that the source's images are resized to fit, pixels.
-        window: (width, height) of the windows, pixels.
+    all windows without an object. Smaller images are padded. ``image`` and ``window`` are
+    (width, height) in pixels: the size that images are resized to fit, and that of the windows.
     """
 
     def __init__(self, source: DescribedSource, image: Size, window: Size, seed: int) -> None:

@@ -22,18 +22,11 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 
 class PhotoFrames:
-    """Photos as frames of a camera.
+    """Photos as frames of a camera ``K`` of a (width, height) ``size``, pixels.
 
     Photos are scaled to cover the frame and cropped at the centre; photos of the frame's size stay
-    unchanged. If there are more frames than photos, they are used again: every second pass is
-    mirrored, and from the third pass on, frames show random regions of the photos.
-
-    Args:
-        images: Photos of a folder or of one split of a folder.
-        num_frames: Number of frames (default: the number of photos).
-        K: Camera matrix, pixels.
-        size: (width, height) of the frames, pixels.
-        seed: Seed of the photos' order and regions.
+    unchanged. If there are more frames than photos (default: as many), they are used again: every
+    second pass is mirrored, and from the third pass on, frames show random regions of the photos.
     """
 
     def __init__(

@@ -1,8 +1,7 @@
 """Define a render job from user input, record it, and claim its folder.
 
 The record holds all settings that determine the bytes of the job's files, in JSON types. A job
-claims a folder by writing its record there. A later job with another record is rejected with the
-fields that differ.
+claims a folder by writing its record there, and is rejected in a folder with another record.
 
 To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """

@@ -1,7 +1,7 @@
 """Render a data set: render missing images, finalize complete chunks, and show the progress.
 
-A job's images form chunks. Finalizing a complete chunk writes the files that its images share. A
-shard is a contiguous part of the job, which may begin and end within a chunk.
+Finalizing a complete chunk writes the files that its images share. A shard is a contiguous part of
+the job, which may begin and end within a chunk.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Provide virtual images as a source, rendered on demand or cached.
 
-Training, validation and test are three disjoint index ranges of a factory, so they share no image.
-Only training images change with the epoch. The cache holds images of epoch 0. Masking and
-augmentation follow the cache, so they differ between epochs.
+Training, validation and test are disjoint index ranges of a factory. Only training images change
+with the epoch. The cache holds images of epoch 0; masking and augmentation follow the cache.
 """
 
 from __future__ import annotations

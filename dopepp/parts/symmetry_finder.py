@@ -1,9 +1,8 @@
 """Search for the symmetries of a part on its mesh.
 
 A rotation is a symmetry if it moves no point of the surface farther from the surface than a
-tolerance, a share of the diameter. Reflections do not count, because they are not rigid motions.
-Textures are ignored. The search uses a normalised shape of diameter 1 about the centroid of its
-surface, which every symmetry preserves.
+tolerance, a share of the diameter. Reflections and textures are ignored. The search uses a shape
+of diameter 1 about the centroid of its surface, which every symmetry preserves.
 """
 
 from __future__ import annotations

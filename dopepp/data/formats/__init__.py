@@ -1,10 +1,8 @@
 """Code that several layouts use: instances, shares of a data set, and resumable writers.
 
-Writers write items one by one and finalize them chunk by chunk. An item's last file marks the item
-as complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
-items staged in a hidden folder.
-
-To add a format, see ``docs/how-to/adding-a-data-format.md``.
+Writers finalize items chunk by chunk. An item's last file marks the item as complete. Files that a
+chunk's items share (``scene_gt.json``, a tar shard) are assembled from items staged in a hidden
+folder. To add a format, see ``docs/how-to/adding-a-data-format.md``.
 """
 
 from __future__ import annotations
@@ -38,7 +36,6 @@ RECORD_FILE: Final = "_dopepp_render.json"
 ESTIMATED: Final = (
     "estimated: mask pixels, or the hull's pixels inside the image, over the hull of the points"
 )
-"""How :func:`make_instance` determines a visible fraction that is not annotated."""
 
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
@@ -99,9 +96,9 @@ def make_instance(
 ) -> Instance:
     """Return the instance of a part at a pose, on an image of ``shape``.
 
-    A visible fraction of NaN is replaced by an estimate: the number of mask pixels (without a mask,
-    the hull's area inside the image) divided by the area of the convex hull of the projected ADD
-    points. The estimate is too small for a concave object.
+    A visible fraction of NaN is estimated: the number of mask pixels (without a mask, the hull's
+    area inside the image) divided by the area of the convex hull of the projected ADD points. The
+    estimate is too small for a concave object.
     """
     if math.isnan(visible_fraction):
         inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)
@@ -146,7 +143,7 @@ def staged_items(staging: Path, suffix: str) -> list[Path]:
 def lock_staging(staging: Path) -> Iterator[None]:
     """Lock a folder of staged items, and remove the folder on exit if it is empty.
 
-    Without the lock, a process could remove items that another process has just staged. The system
+    Otherwise, a process could remove items that another process has just staged. The system
     releases the lock of a killed process.
     """
     path = staging / _LOCK

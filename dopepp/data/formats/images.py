@@ -1,8 +1,8 @@
-"""Decode and encode the images of all layouts.
+"""Decode the images and masks of all layouts.
 
-BOP's images are PNG, JPEG or TIFF files or tar members; the frames and maps of YCB-Video, NDDS and
-FAT are PNG or JPEG files. Masks in BOP-WebDataset are run lengths down the columns, like COCO's
-uncompressed RLE: ``{"size": [height, width], "counts": [zeros, ones, …]}``.
+BOP's images are PNG, JPEG or TIFF; the frames and maps of YCB-Video, NDDS and FAT are PNG or JPEG.
+Masks in BOP-WebDataset are run lengths down the columns, like COCO's uncompressed RLE:
+``{"size": [height, width], "counts": [zeros, ones, …]}``.
 """
 
 from __future__ import annotations
@@ -164,8 +164,8 @@ def check_one_channel(
 def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
     """Convert metres into units of a 16-bit image; return the units and BOP's ``depth_scale``.
 
-    The scale is the finest scale that covers all objects (pixels of ``covered``), e.g. 0.1 mm up
-    to 6.5 m. Background beyond the range is 0 (unknown).
+    The scale is the finest that covers all objects (pixels of ``covered``). Background beyond its
+    range is 0 (unknown).
     """
     farthest = 1000 * float(depth[covered].max(initial=0.0))
     fine, coarse = DEPTH_SCALES_MM
@@ -175,10 +175,7 @@ def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], flo
 
 
 def encode_runs(mask: Mask) -> dict[str, list[int]]:
-    """Encode a mask as COCO's uncompressed run lengths.
-
-    Pixels are counted column by column. Runs of 0 and 1 alternate, and the first is a run of 0.
-    """
+    """Encode a mask as alternating run lengths of 0 and 1, column by column, first of 0."""
     pixels = mask.ravel(order="F")
     borders = np.flatnonzero(np.diff(pixels)) + 1
     runs = np.diff(np.concatenate([[0], borders, [pixels.size]])).tolist()
@@ -188,8 +185,7 @@ def encode_runs(mask: Mask) -> dict[str, list[int]]:
 def decode_runs(record: object, shape: Shape, node: Node) -> Mask | None:
     """Decode the run lengths of a mask; report invalid run lengths and return None.
 
-    The record's size must be the image's ``shape`` (height, width), which bounds memory, and the
-    run lengths must add up to its pixels.
+    The size must be the image's ``shape``, which bounds memory.
     """
     fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")

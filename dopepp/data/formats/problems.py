@@ -1,9 +1,8 @@
 """Report problems of a data set's files: raise the first problem, or collect all problems.
 
 A reader reports a problem at a :class:`Node` and continues with a neutral value (NaN, None, an
-empty list). In a data source, :class:`Problems` raises the first problem. ``dopepp check`` runs the
-same reader with a :class:`CheckReport`, which collects all problems, so a data set that passes a
-check is readable.
+empty list). :class:`Problems` raises the first problem. ``dopepp check`` runs the same reader with
+a :class:`CheckReport`, which collects all problems, so a data set that passes a check is readable.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Shade objects (paper Table 3): cover a given share of the visible pixels of each object.
 
-Random crops of the image's background cover an object inside its box, one after another, until the
-requested number of visible pixels is covered. Pixels are ordered by the time of covering; a share
-is the beginning of this order with the requested number of visible pixels. Shares are exact to
-half a pixel, and a larger share contains a smaller share. The last patch is cut to fit.
-
-A patch lies behind the other objects, so that it covers only the object for which it is sampled.
-Training uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
+Random crops of the image's background cover an object inside its box, one after another. Pixels
+are ordered by the time of covering; a share is the beginning of this order, so it is exact to half
+a pixel, and a larger share contains a smaller share. A patch covers only the object for which it
+is sampled. Training uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Convex pieces: the shape of a part for simulations of rigid bodies.
 
-The decomposition of a mesh (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached:
-for built-in parts in this package, for other meshes in the user's cache, under the hash of the
-mesh.
+The decomposition (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached under the
+hash of the mesh: for built-in parts in this package, for others in the user's cache.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Measures of triangles: areas, samples, the largest distance, a hash, and distances to a surface.
 
-Lengths are returned in the unit of the input. The functions take arrays instead of a
-:class:`~dopepp.parts.part.Mesh`, so that triangles can be measured before they are checked. The
-modules of this package read mesh files.
+The functions take arrays, so that triangles can be measured before they are checked. The modules of
+this package read mesh files.
 """
 
 from __future__ import annotations

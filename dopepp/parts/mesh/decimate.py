@@ -2,8 +2,8 @@
 
 The vertices in each cell of a cubic grid become one vertex at the least-squares intersection of the
 planes of all triangles in the cell (quadric error metric: Garland and Heckbert 1997; in grid cells:
-Lindstrom 2000), so that flat sides stay flat and edges sharp. The method takes seconds, accepts
-holes and disconnected pieces, and moves no point by more than a cell's diagonal.
+Lindstrom 2000), so that flat sides stay flat and edges sharp. No point moves by more than a cell's
+diagonal.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """OBJ files with one texture, OFF files, and triangulation of polygons.
 
-trimesh is not used here (``tests/parts/mesh/test_library.py``). In OBJ files it omits faces that
-are truncated or written with tabs, misreads index 0 and relative indices, silently loses textures,
-and splits vertices where normals differ. trimesh reads a truncated OFF file as a smaller mesh and
-fails at pentagons. This module reports the first damaged line. Only shape and the ``map_Kd``
-texture are read. Files named by a mesh must lie in the mesh's folder.
+trimesh is not used here (``tests/parts/mesh/test_library.py``): it omits truncated faces, misreads
+indices, silently loses textures, splits vertices, and reads a truncated OFF file as a smaller mesh.
+This module reports the first damaged line. Only shape and the ``map_Kd`` texture are read. Files
+named by a mesh must lie in the mesh's folder.
 """
 
 from __future__ import annotations

@@ -28,8 +28,7 @@ TYPES: Final = {
 ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 """Byte order of each format; text is converted to little-endian doubles first."""
 
-_MAX_HEADER_BYTES: Final = 100_000
-"""Hundreds of properties and comments; a longer header could take hours to parse."""
+_MAX_HEADER_BYTES: Final = 100_000  # hundreds of properties; more could take hours to parse
 
 MAX_UNEVEN_ROWS: Final = 2_000_000
 """Most rows with lists of different lengths, which are read singly (seconds, 0.5 GB)."""

@@ -1,10 +1,7 @@
 """Mesh files and YCB-Video models, in metres, checked before use.
 
-Triangles are oriented consistently, and no vertex is moved. Triangles may intersect each other: the
-depth test of every renderer shows the outermost surface.
-
-To add a format, write a reader that returns a :class:`RawMesh` and raises for a damaged file, and
-add it to :data:`READERS`.
+Triangles are oriented consistently, and no vertex is moved. To add a format, write a reader that
+returns a :class:`RawMesh` and raises for a damaged file, and add it to :data:`READERS`.
 """
 
 from __future__ import annotations

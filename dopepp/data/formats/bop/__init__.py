@@ -1,8 +1,7 @@
 """Read BOP's annotations into arrays: cameras, poses and visible fractions, in metres.
 
 A scene's ``scene_*.json`` (by image) and a shard's ``KEY.*.json`` hold the same records. A wrong
-record is reported and leaves NaN in the arrays. A scene has the folders ``rgb`` (or ``gray``),
-``depth``, ``mask`` and ``mask_visib``.
+record is reported and leaves NaN in the arrays.
 """
 
 from __future__ import annotations
@@ -260,10 +259,8 @@ class BopScene:
 def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> BopScene:
     """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
 
-    Args:
-        folder: Folder of the scene.
-        wanted: Numbers of the objects to keep.
-        with_model: Numbers of the objects with a model; empty in a data set without models.
+    Only objects in ``wanted`` are kept. ``with_model`` holds the objects with a model, and is empty
+    in a data set without models.
     """
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)

@@ -1,9 +1,7 @@
 """Check that the records, models, masks and images of a BOP data set agree.
 
 The reader parses the records, and its problems are defects. Optional files (depth, masks) must
-exist for every image of a scene or for none. The report notes scenes without ``scene_gt.json``
-(the ground truth of tests may be private), objects without ``visib_fract`` or a model, and inexact
-rotations.
+exist for every image of a scene or for none. What every reader handles is noted.
 """
 
 from __future__ import annotations
@@ -263,15 +261,8 @@ def check_image(
 ) -> BopPoses:
     """Check camera, poses, boxes, counts and masks of one image; return the poses.
 
-    Args:
-        nodes: Nodes of the records.
-        camera: The image's camera record; None if it is missing.
-        truths: The objects' ``gt`` records.
-        infos: The objects' ``gt_info`` records.
-        shape: (height, width) of the image; None if it cannot be read.
-        has_depth: Whether the camera must state the scale of a depth image.
-        models: Sizes by object number; None without models.
-        read_mask: Reader of the objects' masks.
+    ``camera`` is the image's record, or None if it is missing; ``shape`` is None for an unreadable
+    image. With ``has_depth``, the camera must state the scale of a depth image.
     """
     K = None if camera is None else _check_camera(nodes, camera, shape, has_depth)
     poses = bop.read_poses(truths, infos, nodes)

@@ -1,7 +1,7 @@
 """Read and write BOP's object models: ``obj_000001.ply`` and ``models_info.json``, millimetres.
 
-In addition to BOP's keys, ``models_info.json`` has the part's ``name``, which other tools ignore.
-An object without a name is named after its file, ``obj_000001``.
+In addition to BOP's keys, ``models_info.json`` may have the part's ``name``. Otherwise an object is
+named after its file.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Write poses as a BOP challenge CSV, and read the CSV of any method.
 
 Lines are ``scene_id,im_id,obj_id,score,R,t,time``. R (row by row) and t (millimetres) are numbers
-between spaces; time is in seconds for the whole image, −1 if unknown. BOP's name of the file is
-``METHOD_DATASET-SPLIT.csv``.
+between spaces; time is in seconds for the whole image, −1 if unknown.
 """
 
 from __future__ import annotations

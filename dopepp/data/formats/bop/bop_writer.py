@@ -1,9 +1,7 @@
 """Write BOP's scenewise layout item by item, and finalize it scene by scene.
 
-``train_pbr/000012/`` holds images 12,000 – 12,999: rgb, depth, mask and mask_visib as PNG, and
-``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json``. The scene's hidden folder
-``.items`` keeps an image's records until the scene is finalized. :func:`make_labels` defines the
-records as BOP's toolkit does.
+``train_pbr/000012/`` holds images 12,000 – 12,999. The scene's hidden folder ``.items`` keeps an
+image's records until the scene is finalized.
 """
 
 from __future__ import annotations
@@ -203,16 +201,12 @@ class Labels:
 def make_labels(
     sample: Sample, object_ids: Mapping[str, int], parts: Mapping[str, tuple[Part, Surface]]
 ) -> Labels:
-    """Return a sample's annotation as BOP's toolkit defines it.
+    """Return the annotation of a rendered image, as BOP's toolkit defines it.
 
     A box is (x, y, width, height). Width and height are differences between the coordinates of the
     outermost pixels, so that a single pixel has width 0. The box of an object without a visible
-    pixel consists of −1. The silhouette includes pixels beyond the image's border.
-
-    Args:
-        sample: A rendered image, with depth and a mask of each instance.
-        object_ids: BOP object IDs by label.
-        parts: Parts and surfaces by label.
+    pixel consists of −1. The silhouette includes pixels beyond the image's border. ``object_ids``
+    and ``parts`` are by label.
     """
     visible = [instance.mask for instance in sample.instances if instance.mask is not None]
     assert sample.depth is not None

@@ -1,7 +1,6 @@
 """Check that NDDS and FAT annotations agree with their cuboids, images and settings.
 
-No mesh is needed. Data sets differ in their conventions: x, y, z, w or w, x, y, z; boxes as (row,
-column) or (column, row); OpenCV's or OpenGL's camera axes. The report notes the convention of most
+No mesh is needed. Data sets differ in their conventions. The report notes the convention of most
 objects; deviating objects are defects.
 """
 

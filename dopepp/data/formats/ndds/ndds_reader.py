@@ -26,12 +26,9 @@ from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
 
-_FAT_SUFFIX: Final = "_16k"  # suffix of class names in FAT, e.g. ``003_cracker_box_16k``
-
-_MAX_OBSERVATIONS: Final = 60
-"""Instances, evenly spread over the items, that determine the convention."""
-
-_MAX_COUNTED_ITEMS: Final = 1000  # reading this many annotations takes about a second
+_FAT_SUFFIX: Final = "_16k"  # of class names in FAT, e.g. ``003_cracker_box_16k``
+_MAX_OBSERVATIONS: Final = 60  # instances, evenly spread, that determine the convention
+_MAX_COUNTED_ITEMS: Final = 1000  # takes about a second to read
 
 
 class NddsReader:
@@ -163,7 +160,6 @@ class NddsReader:
     def _instance(
         self, observation: Observation, shape: Shape, counts_truncation: bool
     ) -> Instance:
-        """Return an observation as an instance without a mask, checked by ``check_observation``."""
         T_cam_obj = conventions.check_observation(observation, self.finding.convention)
         part, fraction = observation.part, observation.item.visibility
         keypoints = project_keypoints(part.cuboid, T_cam_obj, observation.K)

@@ -1,8 +1,4 @@
-"""Read BOP-WebDataset: tar shards with random access, so a run resumes exactly.
-
-Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.json``,
-``KEY.gt.json``, ``KEY.gt_info.json`` and ``KEY.mask_visib.json``; lengths are in millimetres.
-"""
+"""Read BOP-WebDataset: tar shards with random access, so a run resumes exactly."""
 
 from __future__ import annotations
 

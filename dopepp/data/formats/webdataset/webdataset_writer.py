@@ -1,8 +1,7 @@
 """Write BOP-WebDataset shards: stage items, and finalize shard by shard.
 
-``train_pbr/shard-000012.tar`` holds images 12,000 – 12,999 in order. ``key_to_shard.json`` lists
-the shard of each key. ``models/`` lies next to the split as in BOP's scenewise layout. Until the
-shard is finalized, each image is a small archive in the hidden folder ``.items``.
+``train_pbr/shard-000012.tar`` holds images 12,000 – 12,999 in order. Until the shard is finalized,
+each image is a small archive in the hidden folder ``.items``.
 """
 
 from __future__ import annotations
@@ -88,11 +87,7 @@ class WebdatasetWriter(BopFolder):
 
 
 def _merge_images(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
-    """Yield key and files of each image of the existing archives, by image number.
-
-    If several archives hold an image, its files in the last archive are used. One image is in
-    memory at a time.
-    """
+    """Yield key and files of each image by number; the last of several archives counts."""
     images: dict[int, tuple[Path, list[TarMember]]] = {}
     for path in paths:
         if path.exists():
