@@ -36,16 +36,13 @@ def test_parses_like_the_json_module(value, ascii_only, indent):
     ('{"a": 1, "a": 1}', "key 'a' twice"),
     ('{"a": 1', "line 1, column 8"),
     ("", "line 1, column 1"),
-    ("[1] 2", "Extra data"),
     (b'{"a": "\xff"}', "byte 7 is not UTF-8"),
     ("{'a': 1}", "line 1, column 2"),
     ("[" * 200_000, "more than 64 levels"),
-    ('{"a":' * 200_000, "more than 64 levels"),
     ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "more than 64 levels"),
     ('["]]]]", ' * 70 + "1" + "]" * 70, "more than 64 levels"),
     ("9" * 5000, "digit"),
     ('"' + '\\"' * 300_000, "line 1"),
-    ('"\\', "line 1"),
 ], ids=lambda value: repr(value)[:20])  # fmt: skip
 def test_invalid_json_is_refused(text, message):
     with pytest.raises(UserError) as caught:

@@ -181,12 +181,6 @@ def test_without_a_mask_the_hull_of_the_cuboid_is_used(fake_source):
     np.testing.assert_array_equal(result.instances[0].keypoints, instance.keypoints)
 
 
-@pytest.mark.parametrize("field", ["probability", "max_height", "max_width"])
-def test_shares_outside_0_to_1_are_rejected(field):
-    with pytest.raises(ValueError, match=f"{field}=1.5"):
-        RandomMask(**{field: 1.5})
-
-
 OBJECT_BLUE = 255
 # Shuffled, so that every crop has contrast.
 ROWS, COLUMNS = (np.random.default_rng(length).permutation(length) for length in SIZE)

@@ -182,8 +182,6 @@ def test_shares_are_disjoint_and_complete(num_items, inner):
         except UserError:
             continue
     assert taken == list(range(num_items))
-    with pytest.raises(ValueError, match="ascending"):
-        share_slice(num_items, (0.5, 0.5), "x")
 
 
 def test_absent_images_and_objects_behind_the_camera_are_counted(scene, open_test, caplog):

@@ -125,7 +125,7 @@ def test_hull_areas_against_trimesh_and_shapes():
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ({"root": "nowhere"}, r"which is not a folder.*set data\.root"),
+    ({"root": "nowhere"}, r"nowhere, which has no data/.*set data\.root"),
     ({"root": "empty"}, r"empty, which has no data/.*a YCB-Video folder"),
     ({"root": "bare"}, r"no image_sets/classes\.txt"),
     ({"part": "servoholder"}, r"'servoholder'.*002_can.*003_box.*004_mug"),
