@@ -158,7 +158,7 @@ def real_rows(root: Path, draws: int, seed: int) -> Iterator[list[str]]:
         str(path.relative_to(root / "data"))[: -len("-color.png")]
         for path in (root / "data").rglob("*-color.png")
     )
-    source = YcbVideoReader(root, list(parts.values()), frames=frames)
+    source = YcbVideoReader(root, list(parts.values()), image_set=frames)
     refiners = {name: PartRefiner(part, ["depth"]) for name, part in parts.items()}
     for number in range(len(source)):
         sample = source.sample(number)

@@ -26,21 +26,18 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
     """Return a decorator that compiles a function with numba and further ``options`` of njit.
 
     Compiled functions release the GIL and are single-threaded, because data loaders fork. Division
-    by zero follows IEEE 754, as in numpy; a check would prevent vectorised loops.
+    by zero follows IEEE 754, as in numpy; a check would prevent vectorised loops. Plain loops
+    compile many times faster than slice assignments, array expressions and calls with constants.
 
     The machine code is cached next to the package, or in the user's cache folder if the package is
     read-only; ``NUMBA_CACHE_DIR`` overrides both. The code of a function is not renewed when a
     function that it calls in another file changes: delete the cache (``*.nbc``).
-
-    Plain loops compile many times faster than slice assignments, array expressions and calls with
-    constants.
     """
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     return cast("Callable[[Function], Function]", compiler)
 
 
 _warm_ups: Final[list[str]] = []
-"""Functions (``module:function``) that are called in other processes at the first compilation."""
 
 
 def compile_in_background(function: str) -> None:

@@ -32,7 +32,6 @@ class UserError(ValueError):
         super().__init__(" ".join(f"got {got}; allowed: {allowed}; fix: {fix}".split()))
 
     def __reduce__(self) -> tuple[type[UserError], tuple[str, str, str]]:
-        """Support pickling between a data loader's worker and its parent."""
         return type(self), (self.got, self.allowed, self.fix)
 
 
@@ -61,15 +60,11 @@ class Interruption(KeyboardInterrupt):
 
 
 def require(package: str, choice: str, extra: str) -> ModuleSpec:
-    """Return the import spec of the package that an option needs, without importing the package.
-
-    Args:
-        package: Name of the package.
-        choice: The option that needs the package, for the message.
-        extra: The extra of dopepp that installs the package.
+    """Return the import spec of a package, without importing the package.
 
     Raises:
-        UserError: The package is not installed.
+        UserError: The package is not installed. The option ``choice`` needs it, and the extra
+            ``extra`` of dopepp installs it.
     """
     spec = find_spec(package)
     if spec is None:
@@ -82,11 +77,7 @@ def require(package: str, choice: str, extra: str) -> ModuleSpec:
 
 
 def check_choice(option: str, value: str, allowed: Iterable[str]) -> None:
-    """Check the value of a command-line option, e.g. ``--unit``, against the allowed values.
-
-    Raises:
-        UserError: The value is not allowed.
-    """
+    """Raise a UserError if a command-line option, e.g. ``--unit``, has no allowed value."""
     if value not in allowed:
         fix = f"pass {option} with one of these values"
         raise UserError(f"{option} {value}", ", ".join(allowed), fix)

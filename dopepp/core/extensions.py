@@ -36,28 +36,21 @@ def enable(packages: Iterable[str]) -> None:
         UserError: A package is not installed or has no entry points.
     """
     packages = list(packages)
-    if not packages:
-        return
-    installed = {_package(entry) for group in _GROUPS for entry in _entries(group)}
+    installed = {_package(entry) for group in _GROUPS if packages for entry in _entries(group)}
     for package in packages:
         if package not in installed:
             allowed = ", ".join(sorted(installed)) or "installed packages with dopepp entry points"
-            raise UserError(
-                f"extensions=[{package}]", allowed, f"pip install {package}, or leave it out"
-            )
-    os.environ[VARIABLE] = ",".join(dict.fromkeys((*_enabled(), *packages)))
+            fix = f"pip install {package}, or leave it out"
+            raise UserError(f"extensions=[{package}]", allowed, fix)
+    if packages:
+        os.environ[VARIABLE] = ",".join(dict.fromkeys((*_enabled(), *packages)))
 
 
 def components(group: str) -> dict[str, str]:
     """Return a group's components in the enabled packages: dotted Python names by short name."""
     enabled = _enabled()
-    if not enabled:
-        return {}
-    return {
-        entry.name: entry.value.replace(":", ".")
-        for entry in _entries(group)
-        if _package(entry) in enabled
-    }
+    entries = _entries(group) if enabled else ()
+    return {e.name: e.value.replace(":", ".") for e in entries if _package(e) in enabled}
 
 
 def advice(group: str, name: str) -> str:
@@ -82,7 +75,6 @@ def config_folders() -> Iterator[tuple[str, Path]]:
 
 
 def _enabled() -> list[str]:
-    """Return the names of the enabled packages from the environment variable."""
     return [name for name in os.environ.get(VARIABLE, "").split(",") if name]
 
 

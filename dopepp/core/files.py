@@ -1,8 +1,8 @@
 """Atomic writing of files, images and CSV, and the user's cache folder.
 
-A file is written next to its path under the name of :func:`partial_path` and then renamed. A killed
-process leaves such a partial file, which :func:`is_abandoned` detects. Files are not synced: they
-survive the death of their process, but not a power cut within seconds.
+A file is written under the name of :func:`partial_path` and then renamed. A killed process leaves
+such a partial file, which :func:`is_abandoned` detects. Files are not synced: they survive the
+death of their process, but not a power cut within seconds.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import UInt8
+from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
 
@@ -30,31 +31,34 @@ _SHIPPED: Final = Path(__file__).parents[1] / "conf"
 CONF: Final = _SHIPPED if _SHIPPED.is_dir() else Path(__file__).parents[2] / "conf"
 """Folder of the config files: inside the package in a wheel, next to the package in a checkout."""
 
-IMAGES: Final = (".png", ".jpg", ".jpeg")
-"""Suffixes of the images that :func:`write_image` writes."""
+IMAGES: Final = (".png", ".jpg", ".jpeg")  # suffixes for write_image
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image atomically as PNG, whatever the path's suffix.
-
-    Raises:
-        ValueError: The image is not uint8 of shape (H, W, 3), or is empty.
-    """
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
-    write_file(path, _encode(image, ".png"))
+    """Write an RGB image atomically as PNG, whatever the path's suffix."""
+    write_file(path, encode_image(image, ".png"))
 
 
 def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an RGB image atomically in the format of the path's suffix, one of :data:`IMAGES`."""
-    write_file(path, _encode(image, path.suffix.lower()))
+    write_file(path, encode_image(image, path.suffix.lower()))
 
 
-def _encode(image: UInt8[np.ndarray, "height width 3"], suffix: str) -> bytes:
-    """Return an RGB image encoded in the format of a suffix, e.g. ``.png``."""
+def encode_image(pixels: NDArray[Any], suffix: str = ".png") -> bytes:
+    """Encode an RGB (uint8) or one-channel (uint8, uint16) image in the format of a suffix.
+
+    Raises:
+        ValueError: The image is empty, or of another type or shape.
+    """
     import cv2  # takes a tenth of a second, and not every command writes images
 
-    return bytes(cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
+    is_image = pixels.ndim == 2 or pixels.shape[2:] == (3,)
+    if pixels.dtype.kind != "u" or pixels.size == 0 or not is_image:
+        allowed = "unsigned integers of shape (H, W, 3) or (H, W)"
+        raise ValueError(f"an image must be {allowed}, got {pixels.dtype} {pixels.shape}")
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(suffix, pixels)[1].tobytes())
 
 
 def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
@@ -70,8 +74,7 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial_path(path).touch()
+        write_file(partial_path(path), b"")
         partial_path(path).unlink()
     except OSError as error:
         problem, fix = f"{path}: {error.strerror}", "pass another path, or make it writable"
@@ -126,9 +129,7 @@ def draft(path: Path) -> Iterator[Path]:
 
 
 PARTIAL_SUFFIX: Final = ".partial"
-
 _PARTIAL: Final = re.compile(r"\..+\.([0-9a-f]{8})-([0-9]+)\.partial")
-
 _ABANDONED_S: Final = 600.0  # age of an abandoned partial file of another machine, seconds
 
 
@@ -166,8 +167,6 @@ def is_abandoned(path: Path, now: float) -> bool:
 
 def _is_running(process: int) -> bool:
     """Return whether a process of this machine exists, True if unknown."""
-    if os.name != "posix":  # signal 0 tests for existence on POSIX only
-        return True
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

@@ -1,7 +1,7 @@
 """Strict JSON for untrusted files.
 
-``json.loads`` accepts ``NaN``, ``1e999`` and duplicate keys, and crashes on deep nesting. This
-module raises :class:`~dopepp.core.errors.UserError` in these cases.
+``json.loads`` accepts ``NaN``, ``1e999`` and duplicate keys, and crashes on deep nesting. Here,
+these raise :class:`~dopepp.core.errors.UserError`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,16 +24,12 @@ MAX_BYTES: Final = 64_000_000
 
 MAX_DEPTH: Final = 64  # the formats here need six
 
-_STRING: Final = r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)'
+_STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
 """A string literal, possibly cut off at the end of the text."""
 
-_STRING_BYTES: Final = re.compile(_STRING.encode(), re.DOTALL)
 _EXPONENT: Final = re.compile(rb"[eE]\+?0*[1-9]\d\d")
 _LONG_DIGITS: Final = 300
 """A number beyond float64's range has three digits of exponent, or this many digits."""
-
-_FLOAT: Final = r"-?\d+(?:\.\d+(?:[eE]\+?\d+)?|[eE]\+?\d+)"
-_NOT_FINITE: Final = re.compile(rf"{_STRING}|(-?Infinity|NaN)|({_FLOAT})", re.DOTALL)
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
@@ -64,61 +61,41 @@ def parse_json(text: str | bytes, where: str) -> object:
             number that is not finite.
     """
     content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
-    bare = _STRING_BYTES.sub(b"", content)
+    bare = _STRING.sub(b"", content)
     if _depth(bare) > MAX_DEPTH:
         raise _bad(where, f"more than {MAX_DEPTH} levels of nesting")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise _bad(where, f"byte {error.start} is not UTF-8") from error
+    # Numbers are only checked if one may overflow, because the check would dominate the time.
+    parse_float = _finite if _may_overflow(bare) else None
     try:
         return json.loads(
-            text,
+            content.decode("utf-8-sig"),
             object_pairs_hook=_object,
-            # Numbers are checked only if one may overflow, because the check would dominate the
-            # time.
-            parse_float=_finite if _may_overflow(bare) else None,
+            parse_float=parse_float,
             parse_constant=_finite,
         )
+    except UnicodeDecodeError as error:
+        raise _bad(where, f"byte {error.start} is not UTF-8") from error
     except json.JSONDecodeError as error:
         problem = f"line {error.lineno}, column {error.colno}: {error.msg}"
         raise _bad(where, problem) from error
-    except _NotFiniteError as error:
-        raise _bad(where, f"{_position(text)}{str(error)!r:.40}, not a finite number") from error
-    except ValueError as error:  # a key twice; an integer of thousands of digits
+    except ValueError as error:  # of a hook; or an integer of thousands of digits
         raise _bad(where, str(error)) from error
-
-
-class _NotFiniteError(ValueError):
-    """A JSON number is not finite, such as ``NaN`` or ``1e999``."""
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Convert the pairs of a JSON object to a dictionary; raise a ValueError for a repeated key."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        twice, _ = Counter(key for key, _ in pairs).most_common(1)[0]
         raise ValueError(f"key {twice!r:.80} twice in one object")
     return fields
 
 
 def _finite(text: str) -> float:
-    """Convert a number's text to a float; raise :class:`_NotFiniteError` if it is not finite."""
     number = float(text)
     if not math.isfinite(number):
-        raise _NotFiniteError(text)
+        raise ValueError(f"{text!r:.40}, not a finite number")
     return number
-
-
-def _position(text: str) -> str:
-    """Return "line …, column …: " of the first number that is not finite, or ""."""
-    for match in _NOT_FINITE.finditer(text):
-        if match[1] or (match[2] and math.isinf(float(match[2]))):
-            line = text.count("\n", 0, match.start()) + 1
-            column = match.start() - text.rfind("\n", 0, match.start())
-            return f"line {line}, column {column}: "
-    return ""
 
 
 def _depth(bare: bytes) -> int:

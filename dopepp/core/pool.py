@@ -4,7 +4,7 @@ A pool receives the pickled function once and yields each item with its future o
 exception or a lost process affects its own item only.
 
 When one process dies, ``concurrent.futures.ProcessPoolExecutor`` and loky lose all items in
-progress and do not report the exit code. When their parent is killed, their processes continue.
+progress and do not report the exit code; when their parent is killed, their processes continue.
 Here, each thread of a ``ThreadPoolExecutor`` has one process behind a pipe.
 
 To add an engine, write a :class:`Pool`.
@@ -54,20 +54,22 @@ _CORES_EVERY_S: Final = 10.0
 
 def available_cores() -> int:
     """Return the number of CPU cores that this process may use; outside Linux, of all CPU cores."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(_cores())
 
 
 def physical_cores() -> int:
     """Return the number of physical CPU cores for this process; outside Linux, of logical cores."""
-    if not hasattr(os, "sched_getaffinity"):
-        return os.cpu_count() or 1
     siblings = set()
-    for core in os.sched_getaffinity(0):
+    for core in _cores():
         path = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list")
         siblings.add(path.read_text() if path.is_file() else str(core))
     return len(siblings)
+
+
+def _cores() -> Iterable[int]:
+    if hasattr(os, "sched_getaffinity"):
+        return os.sched_getaffinity(0)
+    return range(os.cpu_count() or 1)
 
 
 def num_threads() -> int:
@@ -210,7 +212,6 @@ class ProcessPool(Pool):
         return self._threads.submit(self._apply, item)
 
     def _apply(self, item: object) -> Any:
-        """Apply the function to an item in this thread's worker process, started if needed."""
         worker = self._worker
         is_new = worker.process is None
         process = worker.process = worker.process or self._start()
@@ -230,7 +231,6 @@ class ProcessPool(Pool):
         return unpickle_answer(answer)
 
     def _start(self) -> SpawnProcess:
-        """Start this thread's worker process and connect to it."""
         context = get_context("spawn")
         self._worker.connection, remote = context.Pipe()
         process = context.Process(target=_serve, args=(remote,))
@@ -293,9 +293,6 @@ class ClusterPool(Pool):
         asked_by: The option that needs Ray, for error messages.
         option: The option that sets the address, for error messages.
         task_options: Options of ``ray.remote`` for a task, e.g. ``num_gpus`` (default: one core).
-
-    Raises:
-        UserError: Ray is not installed, or there is no cluster at the address.
     """
 
     batch_size = 8  # Ray takes about a millisecond to submit a task

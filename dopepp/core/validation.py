@@ -1,8 +1,8 @@
 """Validation of JSON-like values, by pydantic in its strict JSON mode.
 
-:func:`parse` converts a JSON-like value from a YAML or JSON file to a type, e.g. a frozen dataclass
-whose numbers have a :class:`Range`. :func:`check` validates an argument, and :class:`Checked` the
-fields of a dataclass. The first mistake raises :class:`~dopepp.core.errors.UserError`.
+:func:`parse` converts a value from a YAML or JSON file to a type, e.g. a frozen dataclass whose
+numbers have a :class:`Range`. :func:`check` validates an argument, and :class:`Checked` the fields
+of a dataclass. The first mistake raises :class:`~dopepp.core.errors.UserError`.
 
 Values are never coerced: ``"1"`` is not a number and ``true`` is not an integer. As in JSON, a list
 represents a tuple, and text represents a path. To refuse unknown fields, a dataclass has the line
@@ -76,7 +76,6 @@ class Range:
 
     @property
     def _unit(self) -> str:
-        """Return the unit in parentheses, or an empty string."""
         return f" ({self.unit})" if self.unit else ""
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -138,9 +137,6 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
         name: Dotted name or file of the value, for messages.
         fix: Advice for the user (default: correct the field).
 
-    Returns:
-        The typed object.
-
     Raises:
         UserError: A field is missing, unknown, of the wrong type or out of its range.
     """
@@ -161,20 +157,10 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
 def check(
     name: str, value: object, kind: type[T], limits: Range | None = None, of: object = None
 ) -> T:
-    """Validate an argument of a constructor or function.
+    """Return an argument as ``kind``: an integer becomes a float, a list a tuple if it says so.
 
-    For example ``check("stages", stages, int, Range(1, 6))`` or ``check("refine", refine, bool)``;
-    ``tuple[float, float]`` with a :class:`Span` is a pair (smallest, largest).
-
-    Args:
-        name: Name of the argument, for messages.
-        value: JSON-like value to validate.
-        kind: Required type.
-        limits: Range of the number or numbers.
-        of: Object that has the argument; messages contain its ``name``, or else its class.
-
-    Returns:
-        The value as ``kind``; an integer becomes a float and a list a tuple if ``kind`` says so.
+    For example ``check("stages", stages, int, Range(1, 6))`` or ``check("refine", refine, bool)``.
+    The message contains the ``name`` or else the class of the object ``of`` that has the argument.
 
     Raises:
         UserError: The value is of another type or out of range.
@@ -240,7 +226,6 @@ def _validate(kind: Any, value: object, name: str) -> Any:
 
 
 def _json(value: object, name: str) -> str:
-    """Return a value as JSON text; raise a UserError if JSON cannot represent the value."""
     try:
         return json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -294,7 +279,6 @@ def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
 
 
 def _cause(detail: ErrorDetails) -> UserError | None:
-    """Return the UserError that a dataclass raised in ``__post_init__``, or None."""
     cause = detail.get("ctx", {}).get("error")
     return cause if isinstance(cause, UserError) else None
 

@@ -1,7 +1,7 @@
 """Strict YAML for untrusted files, such as run folders and camera files.
 
-``yaml.safe_load`` runs no code, but expands anchors to gigabytes and crashes on deep nesting. This
-module raises :class:`~dopepp.core.errors.UserError` in these cases.
+``yaml.safe_load`` runs no code, but expands anchors to gigabytes and crashes on deep nesting. Here,
+these raise :class:`~dopepp.core.errors.UserError`.
 """
 
 from __future__ import annotations
@@ -34,11 +34,7 @@ def read_yaml(path: Path) -> object:
 
 
 def parse_yaml(text: str, where: Path | str) -> object:
-    """Parse YAML text from a source ``where`` (for messages). The caller limits its size.
-
-    Raises:
-        UserError: As for :func:`read_yaml`.
-    """
+    """Parse YAML text from a source ``where`` (for messages), like :func:`read_yaml`."""
     try:
         _check_events(text)
         return yaml.safe_load(text)

@@ -57,12 +57,10 @@ class PoseDataModule(LightningDataModule):
         input_size: (width, height) of the network's input, pixels.
         backgrounds: Images for the masking of objects that fill their image; required with
             ``masking``.
-        val_images: Whole images of the camera, if ``val`` shows windows of them (default:
-            ``val``).
+        val_images: Whole images of the camera, if ``val`` shows windows of them.
 
     Raises:
         UserError: The training source has fewer images than a batch.
-        ValueError: ``masking`` is given without ``backgrounds``.
     """
 
     def __init__(
@@ -114,19 +112,18 @@ class PoseDataModule(LightningDataModule):
 
     def train_dataloader(self) -> PoseLoader:
         """Return the loader of batches in random order; the last incomplete batch is dropped."""
-        return self._loader(SampleDataset(self.train_item, len(self.train_source)), shuffle=True)
+        return self._loader(self.train_item, self.train_source, shuffle=True)
 
     def val_dataloader(self) -> PoseLoader:
         """Return the loader of batches in order; all ranks together yield each item once."""
-        return self._loader(SampleDataset(self.val_item, len(self.val_source)), shuffle=False)
+        return self._loader(self.val_item, self.val_source, shuffle=False)
 
-    def _loader(self, dataset: SampleDataset, shuffle: bool) -> PoseLoader:
-        """Return the loader of this process's share of a data set."""
-        rank = self.trainer.global_rank if self.trainer is not None else 0
-        world_size = self.trainer.world_size if self.trainer is not None else 1
+    def _loader(self, item: Item, source: DescribedSource, shuffle: bool) -> PoseLoader:
+        dataset, trainer = SampleDataset(item, len(source)), self.trainer
+        ranks = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
         return PoseLoader(
             dataset,
-            EpochSampler(dataset, self.seed, shuffle, rank, world_size),
+            EpochSampler(dataset, self.seed, shuffle, *ranks),
             self.object_names,
             batch_size=self.batch_size,
             drop_last=shuffle,
@@ -135,11 +132,7 @@ class PoseDataModule(LightningDataModule):
         )
 
     def check_objects(self) -> None:
-        """Check that each object to learn is in a training source.
-
-        Raises:
-            UserError: Objects are in no training source.
-        """
+        """Raise a UserError if an object to learn is in no training source."""
         missing = [name for name in self.object_names if not self.train_source.contains(name)]
         if missing:
             sources = ", ".join(info.name for info in self.train_source.describe())
@@ -179,8 +172,7 @@ class PoseDataModule(LightningDataModule):
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-Item = Callable[[int, int], Sample]
-"""Function of epoch and index that makes a sample."""
+Item = Callable[[int, int], Sample]  # function of epoch and index that makes a sample
 
 
 class SampleDataset(Dataset[Sample | UserError]):
@@ -196,7 +188,6 @@ class SampleDataset(Dataset[Sample | UserError]):
         return self._num_items
 
     def __getitem__(self, key: tuple[int, int]) -> Sample | UserError:
-        """Return the sample of (epoch, index), or the error that it raised."""
         try:
             return self._item(*key)
         except UserError as error:
@@ -227,9 +218,7 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
         return len(range(self._rank, self._num_items, self._world_size))
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Iterate over this rank's items of the current epoch."""
-        epoch = self.epoch if self.shuffle else 0
-        order = np.arange(self._num_items)
+        epoch, order = self.epoch if self.shuffle else 0, np.arange(self._num_items)
         if self.shuffle:
             order = item_rng(self.seed, Purpose.SHUFFLE, epoch).permutation(order)
         items_of_rank = order[self._rank :: self._world_size][: len(self)]
@@ -241,10 +230,7 @@ class PoseLoader(DataLoader[Any]):
     """A ``DataLoader`` that resumes inside an epoch and raises a worker's ``UserError``.
 
     Workers return the error as a value, because ``DataLoader`` turns exceptions into text.
-
-    Args:
-        object_names: Names of the objects, in the network's order.
-        **options: Options of ``DataLoader``.
+    ``object_names`` are in the network's order; ``options`` are those of ``DataLoader``.
     """
 
     def __init__(
@@ -269,29 +255,21 @@ class PoseLoader(DataLoader[Any]):
             **options,
         )
         self._epoch_sampler = sampler
-        self._num_batches = 0
-        self._resume_at = 0
+        self._num_batches = self._resume_at = 0
 
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]  # torch names its own class
-        """Yield the batches of an epoch; after a state was loaded, only its remaining batches.
-
-        Raises:
-            UserError: A worker could not read a sample.
-        """
+        """Yield the batches of an epoch; after a state was loaded, only its remaining batches."""
         self._num_batches, self._resume_at = self._resume_at, 0
         assert self.batch_size is not None
         self._epoch_sampler.skip = self._num_batches * self.batch_size
         for batch in super().__iter__():
             if isinstance(batch, UserError):  # a worker returns its error in place of a batch
-                break
+                # This ends the workers cleanly. Otherwise the exception's traceback keeps them in a
+                # reference cycle, and the collector closes their queues before they have ended.
+                self._iterator = None
+                raise batch
             self._num_batches += 1
             yield batch
-        else:
-            return
-        # This ends the workers cleanly. Otherwise the exception's traceback keeps them in a
-        # reference cycle, and the collector closes their queues before they have ended.
-        self._iterator = None
-        raise batch
 
     def state_dict(self) -> dict[str, int]:
         """Return the number of yielded batches of this pass, which Lightning stores."""
@@ -304,10 +282,9 @@ class PoseLoader(DataLoader[Any]):
 
 def _collate(items: list[Sample | UserError], object_index: dict[str, int]) -> Batch | UserError:
     """Stack samples to a batch, or return the first error among the samples."""
-    for item in items:
-        if isinstance(item, UserError):
-            return item
-    return collate([item for item in items if isinstance(item, Sample)], object_index)
+    errors = [item for item in items if isinstance(item, UserError)]
+    samples = [item for item in items if isinstance(item, Sample)]
+    return errors[0] if errors else collate(samples, object_index)
 
 
 def _start_worker(worker: int) -> None:

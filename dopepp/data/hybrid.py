@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Int
 
-from dopepp.core.errors import UserError
 from dopepp.data.sample import (
     DescribedSource,
     Purpose,
@@ -42,15 +41,13 @@ class HybridSource:
 
     An epoch holds round(share × samples_per_epoch) items of each source in a random order. Each
     source is traversed in its own shuffled order across epochs, so that its items are used equally
-    often; the number of the traversal is the epoch of the source.
+    often; the number of the traversal is the epoch of the source. A missing source gives its share
+    to the other sources, of which there must be one.
 
     Args:
         real: Real camera frames; None for a real share of 0.
         real_fraction: Share of ``real`` in the items of an epoch, in [0, 1].
         synthetic_fraction: Share of ``synthetic`` in the remaining items, in [0, 1].
-
-    Raises:
-        UserError: All three sources are None.
     """
 
     def __init__(
@@ -64,22 +61,15 @@ class HybridSource:
         synthetic_fraction: float = 0.0,
         name: str = "hybrid",
     ) -> None:
-        if real is None and virtual is None and synthetic is None:
-            problem, fix = "a hybrid mix without any source", "set data.root=FOLDER"
-            raise UserError(problem, "at least one source", fix)
-        # A missing source gives its share to the other sources.
         if real is None:
             real_fraction = 0.0
         elif virtual is None and synthetic is None and real_fraction != 1:
             _log.warning("there are no virtual images: the real share is 1, not %g", real_fraction)
             real_fraction = 1.0
+        if synthetic is None or virtual is None:
+            synthetic_fraction = float(virtual is None and synthetic is not None)
         num_real = round(real_fraction * samples_per_epoch)
-        if synthetic is None:
-            num_synthetic = 0
-        elif virtual is None:
-            num_synthetic = samples_per_epoch - num_real
-        else:
-            num_synthetic = round((1 - real_fraction) * synthetic_fraction * samples_per_epoch)
+        num_synthetic = round((1 - real_fraction) * synthetic_fraction * samples_per_epoch)
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
         sources = enumerate((real, virtual, synthetic))
         self._sources = {
@@ -88,11 +78,7 @@ class HybridSource:
         self.name, self._seed, self._length = name, seed, samples_per_epoch
         self._plan = lru_cache(1)(self._make_plan)
         # An epoch may straddle two cycles of a source; older cycles are not needed again.
-        self._order = lru_cache(2 * len(_ROLES))(
-            lambda role, cycle, length: item_rng(seed, Purpose.CYCLE, cycle, role).permutation(
-                length
-            )
-        )
+        self._order = lru_cache(2 * len(_ROLES))(self._make_order)
 
     def __len__(self) -> int:
         return self._length
@@ -107,9 +93,12 @@ class HybridSource:
         roles, ranks = self._plan(epoch)
         role = int(roles[index])
         position = epoch * self.counts[role] + int(ranks[index])
-        length = len(self._sources[role])
-        cycle, rank = divmod(position, length)
-        return role, cycle, int(self._order(role, cycle, length)[rank])
+        cycle, rank = divmod(position, len(self._sources[role]))
+        return role, cycle, int(self._order(role, cycle)[rank])
+
+    def _make_order(self, role: int, cycle: int) -> Order:
+        rng = item_rng(self._seed, Purpose.CYCLE, cycle, role)
+        return rng.permutation(len(self._sources[role]))
 
     def _make_plan(self, epoch: int) -> tuple[Order, Order]:
         """Return each item's source and its rank from 0 among the epoch's items of that source."""
@@ -142,11 +131,8 @@ class WindowedSource(WrappedSource):
 
     Networks that train on windows of renders need windows of photographs too. Each epoch samples
     object and window again, uniformly among the windows that contain the object's centre, or among
-    all windows without an object. Smaller images are padded, as for prediction.
-
-    Args:
-        image: (width, height) that the source's images are resized to fit, pixels.
-        window: (width, height) of the windows, pixels.
+    all windows without an object. Smaller images are padded. ``image`` and ``window`` are
+    (width, height) in pixels: the size that images are resized to fit, and that of the windows.
     """
 
     def __init__(self, source: DescribedSource, image: Size, window: Size, seed: int) -> None:

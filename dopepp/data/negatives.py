@@ -22,18 +22,11 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds
 
 
 class PhotoFrames:
-    """Photos as frames of a camera.
+    """Photos as frames of a camera ``K`` of a (width, height) ``size``, pixels.
 
     Photos are scaled to cover the frame and cropped at the centre; photos of the frame's size stay
-    unchanged. If there are more frames than photos, they are used again: every second pass is
-    mirrored, and from the third pass on, frames show random regions of the photos.
-
-    Args:
-        images: Photos of a folder or of one split of a folder.
-        num_frames: Number of frames (default: the number of photos).
-        K: Camera matrix, pixels.
-        size: (width, height) of the frames, pixels.
-        seed: Seed of the photos' order and regions.
+    unchanged. If there are more frames than photos (default: as many), they are used again: every
+    second pass is mirrored, and from the third pass on, frames show random regions of the photos.
     """
 
     def __init__(
@@ -54,13 +47,7 @@ class PhotoFrames:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``; the epoch is ignored.
-
-        Raises:
-            IndexError: The index is negative, or not below the number of frames.
-        """
-        if not 0 <= index < self._length:
-            raise IndexError(f"index {index} is out of range for {self._length} frames")
+        """Return frame ``index``; the epoch is ignored."""
         round_number, number = divmod(index, len(self._order))
         rng = item_rng(self._seed, Purpose.WINDOW, round_number, number)
         share = 1.0 if round_number < 2 else rng.uniform(0.5, 1.0)
@@ -99,11 +86,7 @@ class UnlabelledRenders(WrappedSource):
 
 
 class FrameMix:
-    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n.
-
-    Args:
-        sources: Each has at least ``num_frames / len(sources)`` frames, rounded up.
-    """
+    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n."""
 
     def __init__(
         self, sources: Sequence[DescribedSource], num_frames: int, name: str = "negatives"
@@ -114,13 +97,7 @@ class FrameMix:
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index``.
-
-        Raises:
-            IndexError: The index is negative, or not below the number of frames.
-        """
-        if not 0 <= index < self._length:
-            raise IndexError(f"index {index} is out of range for {self._length} frames")
+        """Return frame ``index``."""
         item, source = divmod(index, len(self.sources))
         return self.sources[source].sample(item, epoch)
 

@@ -40,9 +40,6 @@ def choose_symmetries(
             has entries by name for some parts, and keeps the symmetries of the others.
         resolution: Smallest movement of the surface that a camera shows, metres. ``auto`` permits
             this distance from the surface, if it exceeds the default tolerance.
-
-    Raises:
-        UserError: A file or an entry is missing or wrong, or a part has no mesh for ``auto``.
     """
     if choice is None:
         return list(parts)
@@ -77,20 +74,14 @@ def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
         fix = "write its symmetries into a file, or set data.symmetries=none"
         raise UserError(problem, "parts with a mesh", fix)
     discrete, continuous = find_symmetries(part.mesh, tolerance)
-    counts = (
-        f"{len(discrete)} discrete symmetries and {len(continuous)} axes of continuous symmetry"
-    )
-    tolerance_mm = 1000 * tolerance * part.diameter
-    _log.info("%s: %s within %.3g mm", part.name, counts, tolerance_mm)
+    found = f"{len(discrete)} discrete symmetries and {len(continuous)} axes of continuous symmetry"
+    _log.info("%s: %s within %.3g mm", part.name, found, 1000 * tolerance * part.diameter)
     is_coloured = part.mesh.texture is not None or part.mesh.colours is not None
     if is_coloured and (len(discrete) or continuous):
         reason = "if they distinguish the sides, set data.symmetries=none"
         _log.warning("%s has colours, which the search ignores: %s", part.name, reason)
-    return replace(
-        part,
-        symmetries_discrete=discrete if len(discrete) else None,
-        symmetries_continuous=continuous,
-    )
+    discrete_or_none = discrete if len(discrete) else None
+    return replace(part, symmetries_discrete=discrete_or_none, symmetries_continuous=continuous)
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
@@ -104,7 +95,6 @@ def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) ->
 
 
 def _read_symmetries(choice: str) -> dict[str, bop_models.Symmetries]:
-    """Return the symmetries (metres) in the file ``choice``, by part name."""
     path = Path(choice)
     if not path.is_file():
         allowed = f"null, {NONE}, {AUTO} or a models_info.json"

@@ -1,8 +1,7 @@
 """Define a render job from user input, record it, and claim its folder.
 
 The record holds all settings that determine the bytes of the job's files, in JSON types. A job
-claims a folder by writing its record there. A later job with another record is rejected with the
-fields that differ.
+claims a folder by writing its record there, and is rejected in a folder with another record.
 
 To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """
@@ -23,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from dopepp.core.errors import NO_SPACE, StoppedError, UserError, system_failure
+from dopepp.core.errors import NO_SPACE, StoppedError, UserError, check_choice, system_failure
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_file
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, check
@@ -159,9 +158,7 @@ def make_job(
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    if layout not in WRITERS:
-        fix = "pass --format with one of these names"
-        raise UserError(f"format {layout!r}", ", ".join(WRITERS), fix)
+    check_choice("--format", layout, WRITERS)
     module, name = WRITERS[layout]
     writer: Callable[[Path, Sequence[Part]], Writer] = getattr(import_module(module), name)
     return writer
@@ -249,10 +246,6 @@ def claim(root: Path, record: Mapping[str, Any]) -> None:
     """Reserve a folder for a job by its record, and remove the files of interrupted writes.
 
     A folder with an equal record is accepted.
-
-    Args:
-        root: Folder of the data set.
-        record: Settings of the job, see :class:`RenderJob`.
 
     Raises:
         UserError: The folder is not writable, or holds another job or other files.

@@ -9,8 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.core.errors import UserError
-from dopepp.core.files import write_png
+from dopepp.core.files import check_target, write_png
 from dopepp.data.render_job import RenderJob
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
@@ -39,21 +38,15 @@ _AXIS_LENGTH: Final = 0.5  # length of a drawn axis, diameters
 def write_preview(job: RenderJob, out: Path) -> Path:
     """Write a contact sheet of the job's first scenes (:func:`preview_sheet`); return its path.
 
-    Args:
-        job: Definition of the images.
-        out: A PNG file, or the data set's folder; the sheet is then ``FOLDER.preview.png``.
+    ``out`` is a PNG file, or the data set's folder; the sheet is then ``FOLDER.preview.png``.
 
     Raises:
         UserError: The sheet cannot be written.
     """
     out = out.resolve()
     path = out if out.suffix.lower() == ".png" else out.parent / f"{out.name}.preview.png"
-    sheet = preview_sheet(job.factory)
-    try:
-        write_png(path, sheet)
-    except OSError as error:
-        problem, fix = f"sheet {path}: {error.strerror}", "pass another folder with --out"
-        raise UserError(problem, "a folder that can be written", fix) from error
+    check_target(path)
+    write_png(path, preview_sheet(job.factory))
     return path
 
 

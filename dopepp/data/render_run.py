@@ -1,7 +1,7 @@
 """Render a data set: render missing images, finalize complete chunks, and show the progress.
 
-A job's images form chunks. Finalizing a complete chunk writes the files that its images share. A
-shard is a contiguous part of the job, which may begin and end within a chunk.
+Finalizing a complete chunk writes the files that its images share. A shard is a contiguous part of
+the job, which may begin and end within a chunk.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from rich import progress as rich_progress
 from rich.console import Console
 from rich.text import Text
 
-from dopepp.core.errors import StoppedError, UserError, system_failure
+from dopepp.core.errors import StoppedError, UserError, check_choice, system_failure
 from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, available_cores
+from dopepp.core.validation import Range, check
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.render_job import RenderJob, claim, is_claimed
 from dopepp.data.rendered import MAX_ITEMS
@@ -92,26 +93,20 @@ def run(
     """
     if num is None:
         raise UserError("no number of images", "-n NUMBER, or --preview", "add e.g. -n 1000")
-    part, open_pool = Shard.parse(shard), _engine(engine, workers, ray_address)
+    part, workers = Shard.parse(shard), available_cores() if workers is None else workers
+    check("--workers", workers, int, Range(1, MAX_WORKERS))
+    check_choice("--engine", engine, ENGINES)
+    if engine != "ray" and ray_address is not None:
+        problem = f"--ray-address {ray_address} with --engine {engine}"
+        raise UserError(problem, "an address together with --engine ray", "add --engine ray")
+
+    def open_pool(content: bytes) -> Pool:
+        if engine == "ray":
+            return ClusterPool(content, ray_address, workers)
+        return ProcessPool(content, workers)
+
     with ProgressDisplay(Console(stderr=True)) as progress:
         return render_dataset(job, out, num, open_pool, part, progress)
-
-
-def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPool:
-    """Return the function that opens the process pool, or raise a UserError for wrong options."""
-    workers = available_cores() if workers is None else workers
-    if not 1 <= workers <= MAX_WORKERS:
-        fix = "pass an allowed number, or leave out --workers"
-        raise UserError(f"--workers {workers}", f"1 to {MAX_WORKERS}", fix)
-    if engine not in ENGINES:
-        fix = "pass --engine with one of these names"
-        raise UserError(f"--engine {engine}", ", ".join(ENGINES), fix)
-    if engine == "ray":
-        return lambda content: ClusterPool(content, ray_address, workers)
-    if ray_address is not None:
-        problem = f"--ray-address {ray_address} with --engine local"
-        raise UserError(problem, "an address together with --engine ray", "add --engine ray")
-    return lambda content: ProcessPool(content, workers)
 
 
 @dataclass(frozen=True)
@@ -123,11 +118,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Parse ``i/n`` with i from 0 to n − 1.
-
-        Raises:
-            UserError: The text has another form.
-        """
+        """Parse ``i/n`` with i from 0 to n − 1; another text is a UserError."""
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if match is None or int(match[1]) >= int(match[2]):
             allowed = "i/n with 0 <= i < n: 0/2 and 1/2 are the two halves"
@@ -136,10 +127,8 @@ class Shard:
 
     def span(self, num_items: int) -> range:
         """Return the shard's indices in a job of ``num_items`` images."""
-        first, last = (
-            num_items * number // self.total for number in (self.number, self.number + 1)
-        )
-        return range(first, last)
+        first, last = num_items * self.number, num_items * (self.number + 1)
+        return range(first // self.total, last // self.total)
 
 
 @dataclass(frozen=True)
@@ -198,7 +187,6 @@ class RenderTasks:
 
     @cached_property
     def _writer(self) -> Writer:
-        """Writer of this process for the images of the data set."""
         cv2.setNumThreads(1)
         os.environ.setdefault(THREADS_SETTING, "1")
         if not is_claimed(self._root):

@@ -1,15 +1,13 @@
 """Provide virtual images as a source, rendered on demand or cached.
 
-Training, validation and test are three disjoint index ranges of a factory, so they share no image.
-Only training images change with the epoch. The cache holds images of epoch 0. Masking and
-augmentation follow the cache, so they differ between epochs.
+Training, validation and test are disjoint index ranges of a factory. Only training images change
+with the epoch. The cache holds images of epoch 0; masking and augmentation follow the cache.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import mmap
 import os
 import zlib
@@ -47,9 +45,6 @@ class RenderedSource:
     Args:
         split: One of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
         scale: Factor by which the camera is closer to the mean of the targets' centres.
-
-    Raises:
-        ValueError: The scale is not positive and finite.
     """
 
     def __init__(
@@ -60,8 +55,6 @@ class RenderedSource:
         name: str = "virtual",
         scale: float = 1.0,
     ) -> None:
-        if not 0 < scale < math.inf:
-            raise ValueError(f"scale must be positive and finite, got {scale}")
         self.factory, self.split, self.name, self.scale = factory, split, name, scale
         self._num_items = num_items
 
@@ -74,7 +67,7 @@ class RenderedSource:
         Raises:
             IndexError: The index is negative, or not below the number of items.
         """
-        if not 0 <= index < self._num_items:
+        if not 0 <= index < self._num_items:  # would be an image of another split
             raise IndexError(f"index {index} is out of range for {self._num_items} items")
         epoch = epoch if self.split == "train" else 0
         rendered = self.factory.render(epoch, FIRST_INDEX[self.split] + index, self.scale)
@@ -121,8 +114,7 @@ _TEXT_LENGTH: Final = 64
 _MAX_INSTANCES: Final = 40
 """Masks are stored as a uint8 map: 0 for the background, i + 1 for instance i."""
 
-_FILLED: Final = 1 << 32
-"""Added to a slot's CRC-32, so that only an empty slot has the checksum 0."""
+_FILLED: Final = 1 << 32  # added to a slot's CRC-32, so that only an empty slot has the checksum 0
 
 
 class CachedSource(WrappedSource):
@@ -205,19 +197,28 @@ class CachedSource(WrappedSource):
             raise UserError(problem, "a folder with at least this much free space", fix) from error
 
     def _resized(self, index: int) -> Sample:
-        """Return an item resized to fit ``input_size``, without depth; unchanged without a size."""
         sample = self._source.sample(index, 0)
         if self._input_size is None:
             return sample
         return replace(resize_sample(sample, self._input_size), depth=None)
 
     def _checksum(self, index: int) -> int:
-        """Return a checksum of a slot that is never 0, the value of an empty slot."""
         return zlib.crc32(self._slots[index : index + 1].view("u1").data) | _FILLED
 
     def _store(self, index: int, sample: Sample) -> None:
-        """Write a sample to its slot, and then the slot's checksum."""
-        self._check(sample)
+        """Write a sample to its slot, and then the slot's checksum.
+
+        Raises:
+            ValueError: A slot cannot represent the sample.
+        """
+        texts = [sample.key, *(instance.label for instance in sample.instances)]
+        layout = (self._shape, self._source_name, self._has_depth)
+        if (sample.image.shape[:2], sample.source, sample.depth is not None) != layout:
+            rule = "a cache holds images of one size and source, all with depth or all without"
+            raise ValueError(f"a {sample.size} image of {sample.source}; {rule}")
+        if len(texts) > _MAX_INSTANCES + 1 or max(map(len, texts)) > _TEXT_LENGTH:
+            most = f"at most {_MAX_INSTANCES} instances and {_TEXT_LENGTH} characters"
+            raise ValueError(f"{len(texts) - 1} instances, with names {texts}; {most}")
         slot = self._slots[index]
         slot["image"], slot["K"], slot["key"] = sample.image, sample.K, sample.key
         labels = np.zeros(sample.image.shape[:2], np.uint8)
@@ -232,18 +233,6 @@ class CachedSource(WrappedSource):
         if sample.depth is not None:
             slot["depth"] = sample.depth
         self._checksums[index] = self._checksum(index)
-
-    def _check(self, sample: Sample) -> None:
-        """Raise a ValueError for a sample that a slot cannot represent."""
-        if len(sample.instances) > _MAX_INSTANCES:
-            raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
-        layout = (self._shape, self._source_name, self._has_depth)
-        if (sample.image.shape[:2], sample.source, sample.depth is not None) != layout:
-            rule = "a cache holds images of one size and source, all with depth or all without"
-            raise ValueError(f"a {sample.size} image of {sample.source}; {rule}")
-        texts = [sample.key, *(instance.label for instance in sample.instances)]
-        if max(map(len, texts)) > _TEXT_LENGTH:
-            raise ValueError(f"one of {texts} has more than {_TEXT_LENGTH} characters")
 
     def _load(self, index: int) -> Sample:
         slot = self._slots[index]
@@ -269,23 +258,9 @@ class CachedSource(WrappedSource):
 
 def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
     """Return the dtype of a slot: one sample with an image of ``shape``."""
-    instance = np.dtype(
-        [
-            ("T_cam_obj", "f8", (4, 4)),
-            ("keypoints", "f8", (9, 2)),
-            ("visible_fraction", "f8"),
-            ("has_mask", "?"),
-            ("label", f"U{_TEXT_LENGTH}"),
-        ]
-    )
-    return np.dtype(
-        [
-            ("image", "u1", (*shape, 3)),
-            ("labels", "u1", shape),
-            ("K", "f8", (3, 3)),
-            ("key", f"U{_TEXT_LENGTH}"),
-            ("num_instances", "i4"),
-            ("instances", instance, (_MAX_INSTANCES,)),
-            *([("depth", "f4", shape)] if has_depth else []),
-        ]
-    )
+    instance = [("T_cam_obj", "f8", (4, 4)), ("keypoints", "f8", (9, 2))]
+    instance += [("visible_fraction", "f8"), ("has_mask", "?"), ("label", f"U{_TEXT_LENGTH}")]
+    fields = [("image", "u1", (*shape, 3)), ("labels", "u1", shape), ("K", "f8", (3, 3))]
+    fields += [("key", f"U{_TEXT_LENGTH}"), ("num_instances", "i4")]
+    fields += [("instances", instance, (_MAX_INSTANCES,))]
+    return np.dtype(fields + ([("depth", "f4", shape)] if has_depth else []))

@@ -207,7 +207,6 @@ def _prism(section: CrossSection, bottom: float = BACK, top: float = FRONT) -> M
 
 
 def _mesh(solid: Manifold) -> Mesh:
-    """Convert a solid in millimetres to triangles in metres."""
     triangles = solid.as_original().simplify(TOLERANCE).to_mesh64()
     # Rounding to a nanometre (1e-6 mm) removes the last digits of sin and cos, which differ between
     # platforms, so that a part has one hash everywhere. Vertices that coincide then are merged.

@@ -16,9 +16,7 @@ from jaxtyping import Float
 from dopepp.parts.mesh import Faces, SurfaceTree, Vertices, half_sphere
 from dopepp.parts.part import Mesh, Part, make_part
 
-STRETCH: Final = 1.3
-"""Factor on the longest side of the stretched copy."""
-
+STRETCH: Final = 1.3  # factor on the longest side of the stretched copy
 _CUT_SHARE: Final = 0.25  # Share of the surface that the cut removes
 _OWN_MIRROR: Final = 0.015  # Largest mirror distance of a part that equals its mirror image
 
@@ -68,7 +66,6 @@ def mirror_distance(mesh: Mesh) -> float:
 
 
 def _meshes(mesh: Mesh) -> Iterator[tuple[str, Mesh]]:
-    """Yield the kind and the mesh of each look-alike."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     if mirror_distance(mesh) > _OWN_MIRROR:
         mirrored = mesh.vertices * (-1.0, 1.0, 1.0)

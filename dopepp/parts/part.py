@@ -39,9 +39,7 @@ logger = logging.getLogger(__name__)
 
 UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}  # Metres per unit of a mesh file
 SMALLEST_DIAMETER: Final = 0.005
-LARGEST_DIAMETER: Final = 5.0
-"""Metres. Other diameters nearly always mean a wrong unit."""
-
+LARGEST_DIAMETER: Final = 5.0  # metres. Other diameters nearly always mean a wrong unit
 MAX_NAME: Final = 200  # Characters; limits the text that a hostile file can print
 MAX_POINTS: Final = 100_000
 MAX_SYMMETRIES: Final = 1000
@@ -163,32 +161,52 @@ class Part:
 
     @classmethod
     def from_record(cls, record: object) -> Part:
-        """Create a part from a record of :meth:`to_record`.
-
-        Raises:
-            UserError: A field is missing, unknown or invalid.
-        """
+        """Create a part from a record of :meth:`to_record`; an invalid field is a UserError."""
         values = parse(_Record, record, "part", _FIX)
-        if not all(any(axis) for axis, _ in values.symmetries_continuous):
-            problem = "part.symmetries_continuous with an axis of length 0"
-            raise UserError(problem, "[axis, offset] with an axis other than 0", _FIX)
+        cuboid = np.array(values.cuboid, np.float64)
+        expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
+        transforms = None
+        if values.symmetries_discrete is not None:
+            transforms = np.array(values.symmetries_discrete, np.float64).reshape(-1, 4, 4)
         mesh, deviation = None, 0.0
         if values.mesh is not None:
             faces = np.array(values.mesh.faces, np.int32)
-            if faces.max() >= len(values.mesh.vertices):
-                allowed = f"0 to {len(values.mesh.vertices) - 1}"
-                raise UserError(f"part.mesh whose faces use vertex {faces.max()}", allowed, _FIX)
             mesh = Mesh(np.array(values.mesh.vertices, np.float64), faces)
             deviation = values.mesh.deviation
+        for is_valid, problem, allowed in (
+            (
+                # Another order of corners would silently give wrong poses; 1e-6 is for float32.
+                np.abs(cuboid - expected).max() <= 1e-6 * np.ptp(cuboid),
+                "cuboid that is not an axis-aligned box",
+                "eight corners in NDDS order, then the centre",
+            ),
+            (
+                transforms is None or all(map(is_rigid, transforms)),
+                "symmetries_discrete with a matrix that is not a rigid transform",
+                "[R t; 0 0 0 1] with a rotation R",
+            ),
+            (
+                all(any(axis) for axis, _ in values.symmetries_continuous),
+                "symmetries_continuous with an axis of length 0",
+                "[axis, offset] with an axis other than 0",
+            ),
+            (
+                mesh is None or mesh.faces.max() < len(mesh.vertices),
+                "mesh whose faces use a missing vertex",
+                "indices of its vertices",
+            ),
+        ):
+            if not is_valid:
+                raise UserError(f"part.{problem}", allowed, _FIX)
         return cls(
             name=check_name(values.name),
-            cuboid=_parse_cuboid(values.cuboid),
+            cuboid=cuboid,
             diameter=values.diameter,
             points=np.array(values.points, np.float64),
             mesh=mesh,
             mesh_deviation=deviation,
             mesh_hash=values.mesh_hash,
-            symmetries_discrete=_parse_transforms(values.symmetries_discrete),
+            symmetries_discrete=transforms,
             symmetries_continuous=tuple(values.symmetries_continuous),
         )
 
@@ -215,8 +233,6 @@ class _MeshRecord:
 
 @dataclass(frozen=True)
 class _Record:
-    """Fields of a :class:`Part` as JSON values."""
-
     __pydantic_config__ = STRICT
     name: str
     cuboid: Annotated[list[_Point], Field(min_length=9, max_length=9)]
@@ -228,31 +244,6 @@ class _Record:
         Annotated[list[tuple[_Row, _Row, _Row, _Row]], Field(max_length=MAX_SYMMETRIES)] | None
     )
     symmetries_continuous: Annotated[list[tuple[_Point, _Point]], Field(max_length=MAX_SYMMETRIES)]
-
-
-def _parse_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
-    """Return the cuboid of a record, if its corners form an axis-aligned box in NDDS order."""
-    cuboid = np.array(rows, np.float64)
-    expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
-    # Another order of corners would silently give wrong poses; 1e-6 is float32's rounding.
-    if not np.abs(cuboid - expected).max() <= 1e-6 * np.ptp(cuboid):
-        problem = "part.cuboid that is not an axis-aligned box"
-        raise UserError(problem, "eight corners in NDDS order, then the centre", _FIX)
-    return cuboid
-
-
-def _parse_transforms(
-    matrices: Sequence[Sequence[_Row]] | None,
-) -> Float[np.ndarray, "symmetries 4 4"] | None:
-    """Return the discrete symmetries of a record, which must be rigid transforms."""
-    if matrices is None:
-        return None
-    transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)
-    for matrix in transforms:
-        if not is_rigid(matrix):
-            problem = "part.symmetries_discrete with a matrix that is not a rigid transform"
-            raise UserError(problem, "[R t; 0 0 0 1] with a rotation R", _FIX)
-    return transforms
 
 
 Parts = Sequence[Part]
@@ -267,17 +258,10 @@ def make_part(
     symmetries_continuous: tuple[ContinuousSymmetry, ...] = (),
     unit: str = "m",
 ) -> Part:
-    """Create a part from a mesh or from ADD points.
+    """Create a part from a mesh or, without a mesh, from ADD points (default: from the surface).
 
-    A mesh of over 200,000 triangles is measured first and then decimated for rendering.
-
-    Args:
-        name: Name of the part.
-        mesh: Triangles, metres; None for a part with ADD points only.
-        points: ADD points, metres (default: 2,000 fixed-seed samples of the surface).
-        symmetries_discrete: As in :class:`Part`.
-        symmetries_continuous: As in :class:`Part`.
-        unit: Unit of the file, for messages.
+    A mesh of over 200,000 triangles is measured first and then decimated for rendering. All
+    lengths are in metres; ``unit`` is that of the file, for messages.
 
     Raises:
         UserError: The name is empty or too long, the diameter is outside 5 mm – 5 m, or the mesh
@@ -330,12 +314,11 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
     """Raise a ``UserError`` with likely units if a diameter (metres) is outside 5 mm – 5 m."""
     if SMALLEST_DIAMETER <= diameter <= LARGEST_DIAMETER:
         return
-    written = diameter / UNITS[unit]
+    written, fix = diameter / UNITS[unit], "export the part at its real size"
     likely = [u for u, s in UNITS.items() if SMALLEST_DIAMETER <= written * s <= LARGEST_DIAMETER]
+    if likely:
+        fix = f"state the file's unit: unit={likely[0]}"
     problem = f"part {name!r} with a diameter of {diameter:.4g} m, from a mesh with unit={unit}"
-    fix = (
-        f"state the file's unit: unit={likely[0]}" if likely else "export the part at its real size"
-    )
     raise UserError(problem, "a diameter of 5 mm – 5 m", fix)
 
 

@@ -7,8 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from dopepp.core.errors import UserError
-from dopepp.core.validation import Span, check
+from dopepp.core.validation import Range, Span, check
 from dopepp.geometry.rotation import Vector
 from dopepp.parts.mesh.read import body_extents
 from dopepp.parts.part import Part
@@ -61,18 +60,11 @@ class LearnedRange(NamedTuple):
 
     @classmethod
     def parse(cls, values: object) -> LearnedRange:
-        """Convert a list of the four values in a checkpoint to a range.
-
-        Raises:
-            UserError: The values are not four numbers, or a number is out of range.
-        """
-        if not isinstance(values, list | tuple) or len(values) != len(cls._fields):
-            fix = "use a checkpoint written by train.py"
-            problem = f"the learned range of sizes {values!r:.100}"
-            raise UserError(problem, ", ".join(cls._fields), fix)
-        pixels, metres = Span(0.1, 1e5, "pixels"), Span(1e-4, 1e4, "metres")
-        sizes = check("sizes of a part", values[:2], tuple[float, float], pixels)
-        depths = check("distances of a part", values[2:], tuple[float, float], metres)
+        """Convert a list of the four values in a checkpoint; raise a UserError for another one."""
+        limits = "the learned range of sizes"
+        four = check(limits, values, tuple[float, float, float, float], Range(1e-4, 1e5))
+        sizes = check("sizes of a part", four[:2], tuple[float, float], Span(0.1, 1e5, "pixels"))
+        depths = check("distances of a part", four[2:], tuple[float, float], Span(1e-4, 1e4, "m"))
         return cls(*sizes, *depths)
 
 

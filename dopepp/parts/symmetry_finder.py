@@ -1,9 +1,8 @@
 """Search for the symmetries of a part on its mesh.
 
 A rotation is a symmetry if it moves no point of the surface farther from the surface than a
-tolerance, a share of the diameter. Reflections do not count, because they are not rigid motions.
-Textures are ignored. The search uses a normalised shape of diameter 1 about the centroid of its
-surface, which every symmetry preserves.
+tolerance, a share of the diameter. Reflections and textures are ignored. The search uses a shape
+of diameter 1 about the centroid of its surface, which every symmetry preserves.
 """
 
 from __future__ import annotations
@@ -275,7 +274,6 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
 
 
 def _across(axis: Vector) -> Vector:
-    """Return a unit vector perpendicular to an axis, a coordinate axis if possible."""
     nearest = np.eye(3)[np.abs(axis).argmin()]
     across = nearest - (nearest @ axis) * axis
     return np.asarray(across / np.linalg.norm(across))

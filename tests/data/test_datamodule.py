@@ -188,11 +188,3 @@ def test_a_batch_without_instances_keeps_one_padding_slot(fake_source):
     sample = fake_source().sample(0)
     sample.instances = []
     assert collate([sample, sample], {"box": 0}).object_index.tolist() == [[PADDING], [PADDING]]
-
-
-def test_to_moves_tensors_and_keeps_the_rest(fake_source):
-    batch = collate([fake_source().sample(0)], {"box": 0})
-    moved = batch.to("meta", non_blocking=True)
-    assert isinstance(moved, Batch)
-    assert moved.images.device.type == moved.object_index.device.type == "meta"
-    assert (moved.object_index.dtype, moved.keys) == (torch.int64, batch.keys)

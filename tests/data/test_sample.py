@@ -10,28 +10,10 @@ from dopepp.data.sample import (
     Sample,
     letterbox_sample,
     pad_sample,
-    resize_nearest,
     resize_sample,
 )
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
-
-
-@settings(max_examples=60)
-@given(
-    shape=st.tuples(st.integers(1, 50), st.integers(1, 50)),
-    target=st.tuples(st.integers(1, 70), st.integers(1, 70)),
-)
-def test_nearest_is_the_source_pixel_under_the_target_centre(shape, target):
-    image = np.arange(shape[0] * shape[1]).reshape(shape)
-    result = resize_nearest(image, *target)
-    assert result.shape == target[::-1]
-    for row in range(0, target[1], 7):
-        for column in range(0, target[0], 7):
-            # Exact rationals: the centre of a target pixel, in source pixels, from the corner.
-            u = (2 * column + 1) * shape[1] // (2 * target[0])
-            v = (2 * row + 1) * shape[0] // (2 * target[1])
-            assert result[row, column] == image[v, u]
 
 
 def dot_sample(size: tuple[int, int], dot: tuple[float, float]) -> Sample:

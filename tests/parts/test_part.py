@@ -58,12 +58,6 @@ def test_an_unlikely_size_names_the_unit_and_suggests_one(scale, unit, message):
         make_part("holder", Mesh(scale * mesh.vertices, mesh.faces), unit=unit)
 
 
-@pytest.mark.parametrize("diameter", [0.005, 5.0])
-def test_the_allowed_sizes_include_their_ends(diameter):
-    points = np.array([[0.0, 0, 0], [diameter, 0, 0]])
-    assert make_part("rod", None, points).diameter == diameter
-
-
 @pytest.mark.parametrize("name", ["", "x" * 201, "two\nlines"])
 def test_a_name_must_be_printable(name):
     with pytest.raises(UserError, match=r"part name .* printable characters"):

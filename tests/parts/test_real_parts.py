@@ -89,7 +89,7 @@ def test_a_folder_without_ycb_models_is_refused(tmp_path):
 )
 def test_damaged_points_are_refused(copied_root, text):
     (copied_root / "models" / GELATIN / "points.xyz").write_text(text)
-    with pytest.raises(UserError, match=r"points\.xyz.*; allowed: lines of three finite numbers"):
+    with pytest.raises(UserError, match=r"points\.xyz.*; allowed: three finite numbers per line"):
         ycb_part(copied_root, GELATIN)
 
 

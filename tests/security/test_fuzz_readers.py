@@ -28,7 +28,6 @@ from trimesh.exchange.stl import export_stl, export_stl_ascii
 
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
-from dopepp.data.archive import safe_extract
 from dopepp.data.check import check_dataset
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_results import read_results
@@ -58,7 +57,7 @@ TOKENS: Final = (
 
 
 NAMES: Final = (
-    "a.ckpt", "a.safetensors", "a.yaml", "archive.tar",
+    "a.ckpt", "a.safetensors", "a.yaml",
     "binary.ply", "binary.stl", "bop/camera.json", "bop/models/models_info.json",
     "bop/train_pbr/000000/scene_camera.json", "bop/train_pbr/000000/scene_gt.json",
     "bop/train_pbr/000000/scene_gt_info.json", "box.3mf", "box.glb", "box.obj", "box.off",
@@ -206,7 +205,6 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
         **{name: (partial(_put, data), read_finite_mesh) for name, data in meshes.items()},
         **{name: (image.save, None) for name, image in photos.items()},
         **{name: (partial(_put, data.encode()), read_yaml) for name, data in text.items()},
-        "archive.tar": (_pack, _extract),
         "a.ckpt": (lambda path: torch.save(content, path), load_network),
         "a.safetensors": (
             lambda path: write_safetensors(path, tensors, {"spec": "{}"}), read_safetensors
@@ -227,21 +225,6 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
 
 def _put(content: bytes, path: Path) -> None:
     path.write_bytes(content)
-
-
-def _pack(path: Path) -> None:
-    folder = path.parent / "packed"
-    (folder / "a").mkdir(parents=True)
-    (folder / "a" / "b.txt").write_text("hello\n" * 50)
-    made = shutil.make_archive(str(path.parent / "made"), "tar", folder)
-    Path(made).replace(path)
-    shutil.rmtree(folder)
-
-
-def _extract(path: Path) -> None:
-    target = path.parent / "unpacked"
-    shutil.rmtree(target, ignore_errors=True)
-    safe_extract(path, target)
 
 
 def _datasets(root: Path) -> dict[str, Target]:

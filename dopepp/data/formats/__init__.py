@@ -1,10 +1,8 @@
 """Code that several layouts use: instances, shares of a data set, and resumable writers.
 
-Writers write items one by one and finalize them chunk by chunk. An item's last file marks the item
-as complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
-items staged in a hidden folder.
-
-To add a format, see ``docs/how-to/adding-a-data-format.md``.
+Writers finalize items chunk by chunk. An item's last file marks the item as complete. Files that a
+chunk's items share (``scene_gt.json``, a tar shard) are assembled from items staged in a hidden
+folder. To add a format, see ``docs/how-to/adding-a-data-format.md``.
 """
 
 from __future__ import annotations
@@ -30,8 +28,7 @@ from dopepp.parts.part import Part
 
 T = TypeVar("T")
 
-STAGING: Final = ".items"
-"""Folder of staged items; readers skip hidden names."""
+STAGING: Final = ".items"  # folder of staged items; readers skip hidden names
 
 RECORD_FILE: Final = "_dopepp_render.json"
 """A render job's record. The underscore marks a settings file, so NDDS readers skip it."""
@@ -39,7 +36,6 @@ RECORD_FILE: Final = "_dopepp_render.json"
 ESTIMATED: Final = (
     "estimated: mask pixels, or the hull's pixels inside the image, over the hull of the points"
 )
-"""How :func:`make_instance` determines a visible fraction that is not annotated."""
 
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
@@ -74,17 +70,14 @@ class Writer(Protocol):
 
 
 def share_slice(num_items: int, part_of: tuple[float, float], name: str) -> slice:
-    """Return the slice of ``num_items`` items between two fractions (first, last) in [0, 1].
+    """Return the slice of ``num_items`` items between two ascending fractions in [0, 1].
 
     Equal bounds are rounded equally, so adjacent shares neither overlap nor leave a gap.
 
     Raises:
         UserError: The share has no item.
-        ValueError: The fractions do not ascend within [0, 1].
     """
     first, last = part_of
-    if not 0 <= first < last <= 1:
-        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
     part = slice(round(first * num_items), round(last * num_items))
     if part.start == part.stop:
         problem = f"{name}: no image in the fraction {first:.3g} – {last:.3g} of {num_items} images"
@@ -103,9 +96,9 @@ def make_instance(
 ) -> Instance:
     """Return the instance of a part at a pose, on an image of ``shape``.
 
-    A visible fraction of NaN is replaced by an estimate: the number of mask pixels (without a mask,
-    the hull's area inside the image) divided by the area of the convex hull of the projected ADD
-    points. The estimate is too small for a concave object.
+    A visible fraction of NaN is estimated: the number of mask pixels (without a mask, the hull's
+    area inside the image) divided by the area of the convex hull of the projected ADD points. The
+    estimate is too small for a concave object.
     """
     if math.isnan(visible_fraction):
         inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)
@@ -123,11 +116,8 @@ def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
-        problem, allowed = (
-            f"{path}, which is not a JSON object",
-            "a file written by `dopepp render`",
-        )
-        raise UserError(problem, allowed, "restore the file from backup, or choose another folder")
+        fix = "restore the file from backup, or choose another folder"
+        raise UserError(f"{path}, which is no JSON object", "a file of `dopepp render`", fix)
     return content
 
 
@@ -144,17 +134,16 @@ def stage_item(path: Path, content: bytes) -> None:
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
     """Return the staged files ``NUMBER*SUFFIX`` in order; none if the folder is missing."""
-    try:
+    with suppress(FileNotFoundError):
         return sorted(staging.glob(f"[0-9]*{suffix}"))
-    except FileNotFoundError:
-        return []
+    return []
 
 
 @contextmanager
 def lock_staging(staging: Path) -> Iterator[None]:
     """Lock a folder of staged items, and remove the folder on exit if it is empty.
 
-    Without the lock, a process could remove items that another process has just staged. The system
+    Otherwise, a process could remove items that another process has just staged. The system
     releases the lock of a killed process.
     """
     path = staging / _LOCK
@@ -190,7 +179,6 @@ def _retry(act: Callable[[], T]) -> T:
 
 
 def _is_open_file(descriptor: int, path: Path) -> bool:
-    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

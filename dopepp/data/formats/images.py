@@ -1,8 +1,8 @@
-"""Decode and encode the images of all layouts.
+"""Decode the images and masks of all layouts.
 
-BOP's images are PNG, JPEG or TIFF files or tar members; the frames and maps of YCB-Video, NDDS and
-FAT are PNG or JPEG files. Masks in BOP-WebDataset are run lengths down the columns, like COCO's
-uncompressed RLE: ``{"size": [height, width], "counts": [zeros, ones, …]}``.
+BOP's images are PNG, JPEG or TIFF; the frames and maps of YCB-Video, NDDS and FAT are PNG or JPEG.
+Masks in BOP-WebDataset are run lengths down the columns, like COCO's uncompressed RLE:
+``{"size": [height, width], "counts": [zeros, ones, …]}``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -21,8 +20,7 @@ from dopepp.data.formats.problems import STRICT, Node, mapping
 from dopepp.drawing import pictures
 from dopepp.drawing.pictures import DepthMap, Mask, RGBImage, Shape
 
-FORMATS: Final = ("PNG", "JPEG", "TIFF")
-"""Formats of BOP's images."""
+FORMATS: Final = ("PNG", "JPEG", "TIFF")  # formats of BOP's images
 
 COLOUR_MODES: Final = ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr")
 """Pillow's pixel types of BOP's colour and grey images."""
@@ -85,27 +83,17 @@ def header_shape(file: Path | io.BytesIO) -> Shape | None:
 
 
 def decode_rgb(content: bytes, where: str) -> RGBImage:
-    """Decode a colour or grey image as RGB, without an alpha channel.
-
-    Raises:
-        UserError: The image is not a PNG, JPEG or TIFF of 8 bits, is damaged, or too large.
-    """
+    """Decode a colour or grey image of 8 bits as RGB; another image is a UserError."""
     image = decode_image(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
     return np.array(image.convert("RGB"))
 
 
 def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -> DepthMap:
-    """Decode a depth image as metres, float32; 0 is unknown.
-
-    Args:
-        content: Bytes of the image file.
-        where: Name of the image in messages.
-        depth_scale: Millimetres per unit; NaN if not stated.
-        shape: (height, width) of the colour image.
+    """Decode a depth image of ``depth_scale`` mm per unit as metres, float32; 0 is unknown.
 
     Raises:
-        UserError: The image is damaged, too large, of another size or type, or has no scale.
+        UserError: The image is damaged, too large, of another size or type, or the scale is NaN.
     """
     node = Node(STRICT, where)
     units = decode_one_channel(node, shape, content, DEPTH_MODES)
@@ -117,11 +105,7 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
 
 
 def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
-    """Decode a mask of an image of ``shape`` (height, width); the object's pixels are not 0.
-
-    Raises:
-        UserError: The mask is damaged, too large, of another size, or has several channels.
-    """
+    """Decode a mask of ``shape``; the object's pixels are not 0. Other images raise a UserError."""
     mask = decode_one_channel(Node(STRICT, where), shape, content)
     assert mask is not None
     return np.asarray(mask != 0)
@@ -151,10 +135,8 @@ def decode_one_channel(
 def read_map(node: Node, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
     """Read a map (depth, labels) of YCB-Video, NDDS or FAT; report an invalid map and return None.
 
-    Args:
-        node: The file.
-        shape: Expected (height, width); None to allow any shape.
-        colour: Whether a colour image, whose meaning is unknown, gives None without a report.
+    ``shape`` is the expected (height, width), or None for any. With ``colour``, a colour image,
+    whose meaning is unknown, gives None without a report.
     """
     image = node["image"].attempt(lambda: pictures.read_image(Path(node.path)))
     if image is not None and image.ndim > 2 and colour:
@@ -179,18 +161,11 @@ def check_one_channel(
     return image
 
 
-def encode_png(pixels: NDArray[Any]) -> bytes:
-    """Encode an RGB (uint8) or one-channel (uint8, uint16) image as PNG."""
-    if pixels.ndim == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".png", pixels)[1])
-
-
 def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
     """Convert metres into units of a 16-bit image; return the units and BOP's ``depth_scale``.
 
-    The scale is the finest scale that covers all objects (pixels of ``covered``), e.g. 0.1 mm up
-    to 6.5 m. Background beyond the range is 0 (unknown).
+    The scale is the finest that covers all objects (pixels of ``covered``). Background beyond its
+    range is 0 (unknown).
     """
     farthest = 1000 * float(depth[covered].max(initial=0.0))
     fine, coarse = DEPTH_SCALES_MM
@@ -200,10 +175,7 @@ def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], flo
 
 
 def encode_runs(mask: Mask) -> dict[str, list[int]]:
-    """Encode a mask as COCO's uncompressed run lengths.
-
-    Pixels are counted column by column. Runs of 0 and 1 alternate, and the first is a run of 0.
-    """
+    """Encode a mask as alternating run lengths of 0 and 1, column by column, first of 0."""
     pixels = mask.ravel(order="F")
     borders = np.flatnonzero(np.diff(pixels)) + 1
     runs = np.diff(np.concatenate([[0], borders, [pixels.size]])).tolist()
@@ -213,8 +185,7 @@ def encode_runs(mask: Mask) -> dict[str, list[int]]:
 def decode_runs(record: object, shape: Shape, node: Node) -> Mask | None:
     """Decode the run lengths of a mask; report invalid run lengths and return None.
 
-    The record's size must be the image's ``shape`` (height, width), which bounds memory, and the
-    run lengths must add up to its pixels.
+    The size must be the image's ``shape``, which bounds memory.
     """
     fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")

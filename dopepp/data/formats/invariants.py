@@ -68,10 +68,7 @@ class Box(NamedTuple):
 
 
 def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
-    """Return why a matrix R is not a rotation, or None.
-
-    Entries of R·Rᵀ may differ from the identity by ``tolerance``. A matrix with NaN gives None.
-    """
+    """Return why R·Rᵀ is not the identity within ``tolerance``, or None; also None for a NaN."""
     if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -82,13 +79,9 @@ def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str |
 def check_translation(node: Node, translation: Vector, diameter: float | None) -> bool:
     """Report a position behind the camera (field ``z``) or an implausible distance (``unit``).
 
-    Args:
-        node: Parent node of the two fields.
-        translation: Camera frame, in the unit of ``diameter``.
-        diameter: The object's diameter; None if unknown.
-
     Returns:
-        Whether the position is plausible; True for a NaN.
+        Whether the position (camera frame, in the unit of the object's diameter) is plausible;
+        True for a NaN.
     """
     depth = float(translation[2])
     if depth <= 0:

@@ -1,9 +1,8 @@
 """Report problems of a data set's files: raise the first problem, or collect all problems.
 
 A reader reports a problem at a :class:`Node` and continues with a neutral value (NaN, None, an
-empty list). In a data source, :class:`Problems` raises the first problem. ``dopepp check`` runs the
-same reader with a :class:`CheckReport`, which collects all problems, so a data set that passes a
-check is readable.
+empty list). :class:`Problems` raises the first problem. ``dopepp check`` runs the same reader with
+a :class:`CheckReport`, which collects all problems, so a data set that passes a check is readable.
 """
 
 from __future__ import annotations
@@ -24,12 +23,8 @@ from dopepp.core.json import MAX_BYTES, parse_json, read_json
 
 _log = logging.getLogger(__name__)
 
-MAX_KEPT: Final = 10_000
-"""Largest number of stored defects, which bounds memory; further defects are only counted."""
-
-FARTHEST: Final = 1e9
-"""Largest number in an annotation, in any unit; its square is exact enough."""
-
+MAX_KEPT: Final = 10_000  # stored defects, which bounds memory; further defects are only counted
+FARTHEST: Final = 1e9  # in any unit; the square of an annotated number is exact enough
 _IMAGES_A_LINE: Final = 1000  # images per progress line of the log
 
 T = TypeVar("T")
@@ -39,13 +34,7 @@ class Problems:
     """Receiver of problems that raises the first problem as a UserError."""
 
     def report(self, path: Path | str, where: str, message: str, allowed: str = "") -> None:
-        """Report a problem.
-
-        Args:
-            path: File with the problem.
-            where: Field in the file, or an empty string.
-            message: Description of the problem.
-            allowed: Allowed values; empty if the message implies them.
+        """Report a problem of the field ``where`` (or "") of a file, with the allowed values.
 
         Raises:
             UserError: Always; a subclass may store the problem instead.
@@ -55,11 +44,7 @@ class Problems:
         raise UserError(": ".join(filter(None, parts)), allowed, fix)
 
     def report_error(self, path: Path | str, where: str, error: UserError) -> None:
-        """Report an error that a function raised while it read a file.
-
-        Raises:
-            UserError: Always, ``error`` itself; a subclass may store the error instead.
-        """
+        """Report an error that a function raised while it read a file: raise or store it."""
         raise error
 
 
@@ -112,7 +97,7 @@ class CheckReport(Problems):
             self.notes.append(text)
 
     def count_image(self) -> None:
-        """Count a checked image, and log the progress every 1,000 images."""
+        """Count a checked image, and log the progress."""
         self.num_images += 1
         if self.num_images % _IMAGES_A_LINE == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
@@ -188,11 +173,10 @@ class Node:
         return _parse_leniently(content) if strict is None else strict[0]
 
     def numbers(self, value: object, *shape: int) -> Float[np.ndarray, "..."]:
-        """Return a field's numbers as an array; report other values and return NaN.
+        """Return a number, or (nested) lists of numbers, as an array of ``shape``.
 
-        Args:
-            value: A number or (nested) lists of numbers; None for a missing field.
-            *shape: Shape of the array. Lists of another shape with as many numbers are accepted.
+        Another value is reported and gives NaN. Lists of another shape with as many numbers are
+        accepted; None is a missing field.
         """
         try:
             array = np.array(value)

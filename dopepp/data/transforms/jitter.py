@@ -1,7 +1,6 @@
-"""Jitter the camera: roll, zoom and shift the image a little.
+"""Jitter the camera, to keep the network from memorising images: roll, zoom and shift the image.
 
-Training uses each render many times; jitter keeps the network from memorising images. Image,
-camera matrix, poses and keypoints follow exactly: a camera that rolls about its optical axis and
+Camera matrix, poses and keypoints follow exactly: a camera that rolls about its optical axis and
 zooms sees the same rays at other pixels.
 """
 

@@ -3,7 +3,6 @@
 A patch is a crop of the image's background, never a solid colour, and at most 0.8 of the object's
 box high and wide; it is smaller if the background has no window of this size. Masks and visible
 fractions lose the covered pixels; keypoints stay, because the network must still estimate them.
-:class:`BackgroundCrops` also serves :mod:`dopepp.data.transforms.shading_protocol`.
 """
 
 from __future__ import annotations
@@ -24,20 +23,15 @@ from dopepp.drawing.pictures import Mask, RGBImage, Shape
 from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
-MIN_CONTRAST: Final = 3.0
-"""Standard deviation that a colour channel of a crop must reach to have contrast, grey levels."""
+MIN_CONTRAST: Final = 3.0  # standard deviation of a colour channel of a crop, grey levels
 
 MAX_DRAWS: Final = 8  # Largest number of crops to sample from an image.
 
 
 class BackgroundCrops:
-    """Sampler of rectangular crops of an image that show no object.
+    """Sampler of rectangular crops of an image, without padding, that show no object.
 
-    Args:
-        image: RGB, without padding, as padding is not background.
-        silhouettes: Pixels of each object, which no crop contains.
-        min_contrast: See :func:`has_contrast`.
-        max_draws: Number of random crops that :meth:`draw` tries.
+    No crop contains a pixel of ``silhouettes``. :meth:`draw` tries ``max_draws`` random crops.
     """
 
     def __init__(
@@ -109,7 +103,6 @@ class BackgroundCrops:
 
 
 def _windows(integral: np.ndarray, size: Shape) -> np.ndarray:
-    """Return the sums in all windows of (height, width) from an integral image."""
     height, width = size
     return np.asarray(
         integral[height:, width:]
@@ -226,6 +219,5 @@ class RandomMask(Checked):
 
 
 def _middle_slice(patch: slice, length: int) -> slice:
-    """Return the ``length`` middle rows or columns of a patch."""
     start = patch.start + (patch.stop - patch.start - length) // 2
     return slice(start, start + length)

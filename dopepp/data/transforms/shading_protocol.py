@@ -1,12 +1,9 @@
 """Shade objects (paper Table 3): cover a given share of the visible pixels of each object.
 
-Random crops of the image's background cover an object inside its box, one after another, until the
-requested number of visible pixels is covered. Pixels are ordered by the time of covering; a share
-is the beginning of this order with the requested number of visible pixels. Shares are exact to
-half a pixel, and a larger share contains a smaller share. The last patch is cut to fit.
-
-A patch lies behind the other objects, so that it covers only the object for which it is sampled.
-Training uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
+Random crops of the image's background cover an object inside its box, one after another. Pixels
+are ordered by the time of covering; a share is the beginning of this order, so it is exact to half
+a pixel, and a larger share contains a smaller share. A patch covers only the object for which it
+is sampled. Training uses :mod:`dopepp.data.transforms.masking` (Eq. 4, one patch) instead.
 """
 
 from __future__ import annotations
@@ -28,13 +25,11 @@ from dopepp.data.transforms.masking import (
 )
 from dopepp.drawing.pictures import Mask, RGBImage
 
-TOLERANCE: Final = 0.02  # Allowed difference of the covered share from the requested share.
+TOLERANCE: Final = 0.02  # allowed difference of the covered share from the requested share
 _SIDES: Final = (0.15, 0.5)
 """Range of a patch's sides as shares of the sides of the object's box, so several patches fit."""
 
-_MAX_PATCHES: Final = 300
-"""More patches would be tiny, as the background has no room for larger crops."""
-
+_MAX_PATCHES: Final = 300  # more would be tiny, as the background has no room for larger crops
 _NEVER: Final = np.iinfo(np.int32).max
 
 
@@ -61,12 +56,7 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
         shares: Shares of each instance's visible pixels to cover, in [0, 1], one per result.
         seed: Seed of the patches, which are crops of the image's background.
         index: Index of the image in the test set; the patches also depend on it.
-
-    Raises:
-        ValueError: A share is outside [0, 1].
     """
-    if not all(0 <= share <= 1 for share in shares):
-        raise ValueError(f"shares must be in [0, 1], got {list(shares)}")
     shape = sample.image.shape[:2]
     silhouettes = [silhouette(instance, shape) for instance in sample.instances]
     crops = BackgroundCrops(sample.image, silhouettes)
@@ -84,7 +74,6 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
 
 
 def _can_be_shaded(instance: Instance) -> bool:
-    """Return whether an instance has a mask with a visible pixel."""
     return instance.mask is not None and bool(instance.mask.any())
 
 

@@ -1,8 +1,7 @@
 """Convex pieces: the shape of a part for simulations of rigid bodies.
 
-The decomposition of a mesh (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached:
-for built-in parts in this package, for other meshes in the user's cache, under the hash of the
-mesh.
+The decomposition (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached under the
+hash of the mesh: for built-in parts in this package, for others in the user's cache.
 """
 
 from __future__ import annotations
@@ -40,17 +39,17 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
         problem, allowed = f"part {part.name} without a mesh", "a built-in part or a mesh file"
         raise UserError(problem, allowed, "pass --part FILE")
     name = f"{part.mesh_hash[:16]}.npz"
-    for path in (_BUILT_IN / name, cache_folder() / "solids" / name):
-        if path.is_file():
-            return _read_pieces(path)
-    require("coacd", f"the decomposition of {part.name}", "robot")
-    logger.info("%s: decomposing the mesh into convex pieces, once: about a minute", part.name)
-    pieces = _decompose(part.mesh)
-    vertices, counts = np.concatenate(pieces).astype(np.float32), [len(piece) for piece in pieces]
-    content = io.BytesIO()
-    np.savez_compressed(content, vertices=vertices, counts=counts)
-    write_file(cache_folder() / "solids" / name, content.getvalue())
-    return _read_pieces(cache_folder() / "solids" / name)
+    path = _BUILT_IN / name
+    if not path.is_file():
+        path = cache_folder() / "solids" / name
+    if not path.is_file():
+        require("coacd", f"the decomposition of {part.name}", "robot")
+        logger.info("%s: decomposing the mesh into convex pieces, once: a minute", part.name)
+        pieces, content = _decompose(part.mesh), io.BytesIO()
+        vertices = np.concatenate(pieces).astype(np.float32)
+        np.savez_compressed(content, vertices=vertices, counts=[len(piece) for piece in pieces])
+        write_file(path, content.getvalue())
+    return _read_pieces(path)
 
 
 def hull_faces(hull: ConvexHull) -> Int[np.ndarray, "faces 3"]:
@@ -80,7 +79,6 @@ def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
 
 
 def _read_pieces(path: Path) -> tuple[Piece, ...]:
-    """Read the vertices of convex pieces (metres) from a cached ``.npz`` file."""
     try:
         with np.load(path, allow_pickle=False) as content:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]

@@ -1,14 +1,12 @@
 """Measures of triangles: areas, samples, the largest distance, a hash, and distances to a surface.
 
-Lengths are returned in the unit of the input. The functions take arrays instead of a
-:class:`~dopepp.parts.part.Mesh`, so that triangles can be measured before they are checked. The
-modules of this package read mesh files.
+The functions take arrays, so that triangles can be measured before they are checked. The modules of
+this package read mesh files.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,20 +22,17 @@ Points = Float[np.ndarray, "points 3"]
 Colours = UInt8[np.ndarray, "vertices 3"]
 """Positions of vertices, vertex indices of triangles, any positions, sRGB of vertices."""
 
-NUM_SURFACE_POINTS: Final = 2000
-"""ADD points of a CAD part, a fixed number so that results are comparable."""
-
-SURFACE_SEED: Final = 2000
-"""Seed of the surface samples, fixed so that a mesh always has the same ADD points."""
-
+NUM_SURFACE_POINTS: Final = 2000  # ADD points of a CAD part, fixed so that results are comparable
+SURFACE_SEED: Final = 2000  # fixed so that a mesh always has the same ADD points
 _FEW_CORNERS: Final = 5000
 """Largest hull with an exhaustive search for the largest distance (a quarter of a second)."""
+
 
 NUM_COVERING: Final = 60_000
 """Surface points of a :class:`SurfaceTree`, about 0.6 % of a compact part's diameter apart."""
 
 _NUM_NEIGHBOURS: Final = 6
-"""Surface points whose triangles are compared, as near an edge the nearest point's triangle may not
+"""Surface points whose triangles are compared: near an edge, the nearest point's triangle may not
 be the nearest triangle."""
 
 
@@ -100,19 +95,14 @@ def largest_distance(points: Points) -> float:
     if rank == 0:
         return 0.0
     if rank == 1:
-        along = offsets @ axes[0]
-        corners = points[[along.argmin(), along.argmax()]]
-    else:
-        flat = offsets @ axes[:rank].T
-        corners = points if _is_round(flat) else points[scipy.spatial.ConvexHull(flat).vertices]
-    if len(corners) <= _FEW_CORNERS:
-        return _farthest(corners, corners)[0]
-    distance, end = max(_longest_of_directions(corners))
-    while True:
-        longer, end = _farthest(corners[[end]], corners)
-        if longer <= distance:
-            return distance
-        distance = longer
+        return float(np.ptp(offsets @ axes[0]))
+    flat = offsets @ axes[:rank].T
+    corners = points if _is_round(flat) else points[scipy.spatial.ConvexHull(flat).vertices]
+    if len(corners) > _FEW_CORNERS:
+        corners = corners[_extremes(corners)]
+    # 512 rows at a time keep the distances of 5,000 corners in a fast cache.
+    blocks = (corners[start : start + 512] for start in range(0, len(corners), 512))
+    return max(float(scipy.spatial.distance.cdist(block, corners).max()) for block in blocks)
 
 
 def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
@@ -124,28 +114,17 @@ def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
     return 2 * len(scipy.spatial.ConvexHull(sample, qhull_options="QJ").vertices) > len(sample)
 
 
-def _farthest(sources: Float[np.ndarray, "sources 3"], points: Points) -> tuple[float, int]:
-    """Return the largest distance from a source to a point, and the index of that point."""
-    best, end = -1.0, 0
-    # 512 rows at a time keep the distances of a 100,000-vertex hull under 0.5 GB.
-    for start in range(0, len(sources), 512):
-        distances = scipy.spatial.distance.cdist(sources[start : start + 512], points)
-        if distances.max() > best:
-            best, end = float(distances.max()), int(distances.argmax()) % len(points)
-    return best, end
-
-
-def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
-    """Yield, per 16 directions, the largest distance of extreme points, and the index of one."""
+def _extremes(points: Points) -> Int[np.ndarray, " extremes"]:
+    """Return the indices of the first and last points along 2,500 directions."""
     # Along a direction at an angle φ to the diameter, the distance is at least cos φ diameters, and
     # with 2,500 directions φ is below 2.42°. Single precision suffices and halves the time.
     directions = half_sphere(2500).astype(np.float32)
     columns = np.ascontiguousarray((points - points.mean(axis=0)).T, np.float32)
+    ends: set[int] = set()
     for start in range(0, len(directions), 16):
         along = directions[start : start + 16] @ columns
-        lowest, highest = along.argmin(axis=1), along.argmax(axis=1)
-        distances = np.linalg.norm(points[lowest] - points[highest], axis=1)
-        yield float(distances.max()), int(lowest[distances.argmax()])
+        ends.update(along.argmin(axis=1).tolist(), along.argmax(axis=1).tolist())
+    return np.array(sorted(ends))
 
 
 def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
@@ -165,7 +144,7 @@ def hash_triangles(vertices: Vertices, faces: Faces) -> str:
 
 def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"], Faces]:
     """Merge vertices at exactly one position; faces that become degenerate remain."""
-    # Adding 0.0 turns −0.0 into 0.0.
+    # Adding 0.0 turns −0.0 into 0.0. np.unique(axis=0) would take ten times as long.
     positions = vertices + 0.0
     order = np.lexsort(positions.T[::-1])  # sort by x, then y, then z
     ranked = positions[order]

@@ -2,8 +2,8 @@
 
 The vertices in each cell of a cubic grid become one vertex at the least-squares intersection of the
 planes of all triangles in the cell (quadric error metric: Garland and Heckbert 1997; in grid cells:
-Lindstrom 2000), so that flat sides stay flat and edges sharp. The method takes seconds, accepts
-holes and disconnected pieces, and moves no point by more than a cell's diagonal.
+Lindstrom 2000), so that flat sides stay flat and edges sharp. No point moves by more than a cell's
+diagonal.
 """
 
 from __future__ import annotations
@@ -34,11 +34,8 @@ def decimate(
 ]:
     """Replace triangles by at most ``max_faces`` larger triangles.
 
-    Args:
-        vertices: Positions.
-        faces: Triangles, all with an area.
-        values: Texture coordinates or colours, which remain separate at seams, or None.
-        max_faces: Largest number of triangles.
+    All ``faces`` must have an area. ``values`` are texture coordinates or colours, which remain
+    separate at seams.
 
     Returns:
         New vertices, faces and values, and the largest distance that a vertex moved.
@@ -108,7 +105,6 @@ def _select_triangles(corners: Faces) -> Int[np.ndarray, " kept"]:
 def _means(
     values: Float[np.ndarray, "values width"], owners: Int[np.ndarray, " values"]
 ) -> Float[np.ndarray, "owners width"]:
-    """Return the mean of each owner's values; ``owners`` holds the index of each value's owner."""
     counts = np.maximum(np.bincount(owners), 1)
     sums = [np.bincount(owners, column) for column in values.T]
     return np.stack(sums, axis=1) / counts[:, None]

@@ -190,7 +190,6 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _packed(header: dict[str, Any], binary: bytes) -> bytes:
-    """Return the bytes of a GLB file with a JSON header and a binary chunk."""
     text = json.dumps(header).encode()
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
@@ -242,9 +241,7 @@ def _image_number(header: dict[str, Any], primitive: dict[str, Any]) -> int | No
 def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     """Read a file's content with trimesh, which cannot access other files without a path.
 
-    Args:
-        data: Content of the file.
-        kind: Suffix of the format, without the dot.
+    ``kind`` is the suffix of the format, without the dot.
 
     Returns:
         The merged meshes, with trimesh's name of the unit, and the number of meshes.

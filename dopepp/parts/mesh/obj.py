@@ -1,10 +1,9 @@
 """OBJ files with one texture, OFF files, and triangulation of polygons.
 
-trimesh is not used here (``tests/parts/mesh/test_library.py``). In OBJ files it omits faces that
-are truncated or written with tabs, misreads index 0 and relative indices, silently loses textures,
-and splits vertices where normals differ. trimesh reads a truncated OFF file as a smaller mesh and
-fails at pentagons. This module reports the first damaged line. Only shape and the ``map_Kd``
-texture are read. Files named by a mesh must lie in the mesh's folder.
+trimesh is not used here (``tests/parts/mesh/test_library.py``): it omits truncated faces, misreads
+indices, silently loses textures, splits vertices, and reads a truncated OFF file as a smaller mesh.
+This module reports the first damaged line. Only shape and the ``map_Kd`` texture are read. Files
+named by a mesh must lie in the mesh's folder.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from dopepp.drawing.pictures import FORMATS, MAX_SIDE, RGBImage, read_picture
 from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
 MAX_OFF_BYTES: Final = 50_000_000  # size of an OFF file; parsing needs 15 times as much
-MAX_MATERIAL_BYTES: Final = 10_000_000
-"""Largest material file (a hundred thousand materials); bounds memory."""
+MAX_MATERIAL_BYTES: Final = 10_000_000  # a hundred thousand materials; bounds memory
 
 NO_COORDINATE: Final = -1  # Texture coordinate index of a corner without coordinates
 
@@ -169,7 +167,6 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file with LF line ends; file names in any encoding remain intact."""
     return path.read_bytes().decode("utf-8", "surrogateescape").replace("\r\n", "\n")
 
 
@@ -238,10 +235,8 @@ def fans(
 ) -> Int[np.ndarray, "triangles 3"]:
     """Triangulate polygons as fans around their first corners.
 
-    Args:
-        vertices: Positions.
-        corners: Vertex index of each corner, polygon by polygon; not checked here.
-        counts: Number of corners of each polygon.
+    ``corners`` are the vertex indices polygon by polygon, which are not checked here; ``counts``
+    are the numbers of corners of the polygons.
 
     Returns:
         Triangles as indices into ``corners``.

@@ -28,8 +28,7 @@ TYPES: Final = {
 ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 """Byte order of each format; text is converted to little-endian doubles first."""
 
-_MAX_HEADER_BYTES: Final = 100_000
-"""Hundreds of properties and comments; a longer header could take hours to parse."""
+_MAX_HEADER_BYTES: Final = 100_000  # hundreds of properties; more could take hours to parse
 
 MAX_UNEVEN_ROWS: Final = 2_000_000
 """Most rows with lists of different lengths, which are read singly (seconds, 0.5 GB)."""
@@ -105,7 +104,6 @@ def read_ply(path: Path) -> RawMesh:
 
 
 def _vectors(vertex: Table, names: Sequence[str]) -> NDArray[np.float64] | None:
-    """Return the named vertex properties as columns, or None if a property is missing."""
     if not {*names} <= set(vertex):
         return None
     return np.stack([vertex[name] for name in names], axis=1).astype(np.float64)
@@ -143,7 +141,6 @@ def _split(data: bytes) -> tuple[bytes, bytes]:
 
 
 def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
-    """Return whether the body is text, and its elements."""
     formats = [words[1] for words in lines if words[:1] == ["format"]]
     if len(formats) != 1 or formats[0] not in ORDERS:
         raise ValueError(f"format {formats}, not one of {', '.join(ORDERS)}")
@@ -220,7 +217,6 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
 
 
 def _length(body: bytes, start: int, kind: np.dtype[Any]) -> int:
-    """Return the length of a list; a fractional, negative or too large number is an error."""
     written = np.frombuffer(body, kind, 1, start)[0].item()
     if written != int(written) or not 0 <= written <= len(body):
         raise ValueError(f"a list of {written} values")

@@ -1,14 +1,12 @@
 """Mesh files and YCB-Video models, in metres, checked before use.
 
-Triangles are oriented consistently, and no vertex is moved. Triangles may intersect each other: the
-depth test of every renderer shows the outermost surface.
-
-To add a format, write a reader that returns a :class:`RawMesh` and raises for a damaged file, and
-add it to :data:`READERS`.
+Triangles are oriented consistently, and no vertex is moved. To add a format, write a reader that
+returns a :class:`RawMesh` and raises for a damaged file, and add it to :data:`READERS`.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import warnings
 from collections.abc import Callable
@@ -20,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 from dopepp.parts.mesh import Faces, Points, RawMesh, Vertices, connected, face_areas, weld
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
 from dopepp.parts.mesh.obj import read_obj, read_off
@@ -40,8 +39,7 @@ READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
 }
 """Readers by suffix."""
 
-MANY_CAVITIES: Final = 1000
-"""More cavities than any part has; further inverted surfaces count as bodies."""
+MANY_CAVITIES: Final = 1000  # more than any part has; further inverted surfaces count as bodies
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
@@ -102,14 +100,10 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
 
 
 def ycb_part(root: str | Path, name: str) -> Part:
-    """Read a part from the files ``points.xyz`` and ``textured.obj`` of a YCB-Video model.
+    """Read an object (a folder in ``models``) from the files of YCB-Video at ``root``.
 
-    Both files are in metres. Without a ``textured.obj`` the part has no mesh, and the ADD points
-    determine its cuboid and diameter.
-
-    Args:
-        root: Root folder of YCB-Video.
-        name: Name of the object, a folder in ``models``.
+    ``points.xyz`` and ``textured.obj`` are in metres. Without a ``textured.obj`` the part has no
+    mesh, and the ADD points determine its cuboid and diameter.
 
     Raises:
         UserError: The folder has no models, the name is unknown, or a file is damaged.
@@ -125,22 +119,25 @@ def ycb_part(root: str | Path, name: str) -> Part:
         raise UserError(f"unknown object {name!r}", ", ".join(names), fix)
     points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
     mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
-    return make_part(name, mesh, _read_points(points_path), unit="m")
+    return make_part(name, mesh, read_points(points_path), unit="m")
 
 
-def _read_points(path: Path) -> Points:
-    """Read a text file of points, with x, y and z in each line."""
-    allowed = "lines of three finite numbers"
+def read_points(path: Path) -> Points:
+    """Read a text file of points, with x, y and z in each line.
+
+    Raises:
+        UserError: The file is missing, too large or damaged.
+    """
     try:
-        if path.stat().st_size > MAX_POINTS_BYTES:
-            raise ValueError(f"{path.stat().st_size} bytes, over {MAX_POINTS_BYTES}")
+        content = read_limited(path, MAX_POINTS_BYTES)
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns of an empty file
-            points = np.loadtxt(path, ndmin=2)
+            points = np.loadtxt(io.BytesIO(content), ndmin=2)
+        if points.shape[1] != 3 or not np.isfinite(points).all():
+            raise ValueError(f"shape {points.shape}, or not finite")
     except (OSError, ValueError, UserWarning) as error:
+        allowed = "three finite numbers per line"
         raise UserError(f"{path}: {error}", allowed, "unpack the model again") from error
-    if points.shape[1] != 3 or not np.isfinite(points).all():
-        raise UserError(f"{path} of shape {points.shape}", allowed, "unpack the model again")
     return np.asarray(points, np.float64)
 
 
@@ -182,7 +179,6 @@ def _clean_mesh(path: Path, raw: RawMesh) -> Mesh:
 
 
 def _damage_error(path: Path, problem: str, fix: str = "export the mesh again") -> UserError:
-    """Return the error for a mesh file that is damaged or too large."""
     content = "triangles, finite coordinates and colours of their range"
     allowed = f"a complete mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
     return UserError(f"mesh {path} with {problem}", allowed, fix)
@@ -243,7 +239,13 @@ def misoriented_faces(
     if topology.is_closed:
         if _signed_volumes(vertices, flip_faces(faces, inverted)).sum() < 0:
             inverted = ~inverted
-        inverted ^= _find_inverted_bodies(vertices, flip_faces(faces, inverted), topology)
+        oriented = flip_faces(faces, inverted)
+        count, bodies = connected(*topology.neighbours.T, len(faces))
+        volumes = np.bincount(bodies, _signed_volumes(vertices, oriented), minlength=count)
+        corner_bodies = np.repeat(bodies, 3)
+        boxes = _bounding_boxes(vertices[oriented].reshape(-1, 3), corner_bodies, count)
+        enclosed = _find_enclosed(*boxes, np.flatnonzero(volumes < 0))
+        inverted ^= ((volumes < 0) & ~enclosed)[bodies]
     return inverted
 
 
@@ -270,18 +272,6 @@ def _find_minority(
     flip_is_better = weight[flipped] > weight[as_is]
     tied = (weight[flipped] == weight[as_is]) & (flipped < as_is)
     return np.asarray(flip_is_better | tied)
-
-
-def _find_inverted_bodies(
-    vertices: Vertices, faces: Faces, topology: Topology
-) -> Bool[np.ndarray, " faces"]:
-    """Mark the triangles of closed bodies that face inwards and lie in no other body's box."""
-    first_face, second_face = topology.neighbours.T
-    count, bodies = connected(first_face, second_face, len(faces))
-    volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=count)
-    lower, upper = _bounding_boxes(vertices[faces].reshape(-1, 3), np.repeat(bodies, 3), count)
-    inwards = volumes < 0
-    return np.asarray((inwards & ~_find_enclosed(lower, upper, np.flatnonzero(inwards)))[bodies])
 
 
 def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
-from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.bop.bop_models import bop_parts
 from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.formats.problems import MAX_KEPT, CheckReport
@@ -154,14 +153,12 @@ BOP = {
     "not an image number": Case(f"{GT}:x", [], "scene_gt.json: 'x': not an image number"),
     "rotation scaled": Case(ROTATION, times(1.01), "0[0].cam_R_m2c: not a rotation"),
     "rotation mirrored": Case(ROTATION, times(-1), "0[0].cam_R_m2c: not a rotation"),
-    "rotation short": Case(ROTATION, [1.0] * 8, "0[0].cam_R_m2c: [1.0"),
     "rotation gone": Case(ROTATION, None, "0[0].cam_R_m2c: missing"),
     "rotation of words": Case(ROTATION, ["a"] * 9, "0[0].cam_R_m2c: ['a'"),
     "behind": read(PLACE, [0.0, 0, -400], "0[1].cam_t_m2c.z: behind the camera"),
     "metres": read(f"{GT}:2.0.cam_t_m2c", times(0.001), "2[0].cam_t_m2c.unit:"),
     "moved": read(PLACE, [90.0, 0.0, 340.0], "0[1].box: visible at"),
     "too near": read(PLACE, times(0.25), "0[1].box: "),
-    "object of words": Case(f"{GT}:0.0.obj_id", "9", "0[0].obj_id: '9'"),
     "huge number": Case(f"{GT}:0.0.cam_t_m2c", [10**400, 0, 0], "0[0].cam_t_m2c:"),
     "object no record": Case(f"{GT}:0.0", 5, "0[0]: 5"),
     "focal length": read(f"{CAMERA}:0.cam_K", intrinsics(-150.0, 64), "camera.json: 0.cam_K:"),
@@ -175,7 +172,6 @@ BOP = {
     "fraction and counts": read(f"{INFO}:0.1.visib_fract", 0.2, "0[1].visib_fract: 0.2, but"),
     "counts": read(f"{INFO}:0.1.px_count_visib", times(1.5), "0[1].px_count_visib"),
     "visible box": read(f"{INFO}:0.1.bbox_visib", [0, 0, 20, 20], "0[1].bbox_visib:"),
-    "box short": read(f"{INFO}:0.1.bbox_obj", [0], "0[1].bbox_obj: [0]"),
     "diameter in m": read(f"{MODELS}:1.diameter", times(0.001), "1.unit: 0.0"),
     "diameter and box": read(f"{MODELS}:1.diameter", times(2), "1.diameter: 1"),
     "symmetry": Case(SYMMETRY, times(2), "1.symmetries_discrete[0]: not a rotation"),
@@ -191,15 +187,11 @@ WEBDATASET = {
     "no image": read("rgb.png", None, f"{FIRST}.rgb.png: member: missing"),
     "no camera": read("camera.json", None, f"{FIRST}.camera.json: member: missing"),
     "depth size": read("depth.png", SMALL, f"{FIRST}.depth.png: size"),
-    "rotation": Case("gt.json:0.cam_R_m2c", times(1.1), "gt.json: [0].cam_R_m2c: not a rotation"),
     "behind": read("gt.json:0.cam_t_m2c", [0, 0, -1], f"{FIRST}.gt.json: [0].cam_t_m2c.z: behind"),
-    "moved": read("gt.json:1.cam_t_m2c", [90.0, 0.0, 340.0], "[1].box: "),
     "gt of no list": Case("gt.json", b'{"a": 1}', f"{FIRST}.gt.json: "),
     "gt cut": Case("gt.json", half, f"{FIRST}.gt.json: JSON: "),
-    "K": read("camera.json:cam_K", intrinsics(150, 640), f"{FIRST}.camera.json: cam_K:"),
     "K short": Case("camera.json:cam_K", [1.0], f"{FIRST}.camera.json: cam_K"),
     "one info": Case("gt_info.json:0", None, f"{FIRST}.gt_info.json: "),
-    "fraction": Case("gt_info.json:0.visib_fract", "1", "gt_info.json: [0].visib_fract"),
     "runs": Case("mask_visib.json:0.counts", [5], f"{FIRST}.mask_visib.json: 0: counts"),
     "mask gone": Case("mask_visib.json:1", None, f"{FIRST}.mask_visib.json: 1: missing"),
 }
@@ -228,15 +220,11 @@ NDDS = {
     "unknown class": read(f"{OBJECT}.class", "ball", "objects[0].class: unknown object 'ball'"),
     "class of number": Case(f"{OBJECT}.class", 5, "objects[0].class: 5"),
     "no rotation": read(QUATERNION, times(1.1), "quaternion_xyzw: norm"),
-    "zero rotation": Case(QUATERNION, times(0), "quaternion_xyzw: norm"),
-    "short rotation": Case(QUATERNION, [1, 0], "[0].quaternion_xyzw: [1, 0]"),
     "no location": Case(LOCATION, None, "objects[0].location: missing"),
-    "location of words": Case(LOCATION, ["a", "b", "c"], "objects[0].location: ['a'"),
     "another rotation": read(QUATERNION, turn, "[0].quaternion_xyzw: not the cuboid's orientation"),
     "another order": read(QUATERNION, roll, "[0].quaternion_xyzw: w, x, y, z; 5 objects"),
     "behind": read(LOCATION, [0, 0, -40], "objects[0].location.z: behind the camera"),
     "metres": read(LOCATION, times(0.01), "objects[0].location.unit: "),
-    "millimetres": read(LOCATION, times(10), "objects[0].location.unit: "),
     "cuboid in m": read(OBJECT, lambda entry: entry | {n: times(0.01)(entry[n]) for n in LENGTHS},
                         "objects[0].cuboid.unit: edges"),
     "cuboid of another": read(f"{SETTINGS}:exported_objects.0.cuboid_dimensions", [9, 4, 2],
@@ -253,7 +241,6 @@ NDDS = {
     "pose transform place": read(f"{OBJECT}.pose_transform.3.0", 5.0,
                                  "objects[0].pose_transform: translation"),
     "visibility": Case(f"{OBJECT}.visibility", 4, "objects[0].visibility: 4"),
-    "visibility of words": Case(f"{OBJECT}.visibility", "much", "objects[0].visibility: 'much'"),
     "bounding box": read(BOX, {"top_left": [0, 0], "bottom_right": [9, 9]},
                          "objects[0].bounding_box: (0, 0)–(9, 9) does not contain"),
     "bounding box turned": read(BOX, {"top_left": [9, 9], "bottom_right": [0, 0]},
@@ -265,7 +252,6 @@ NDDS = {
     "ids twice": read(f"{OBJECT}.segmentation_id", 2, "objects.segmentation_id: 2 twice"),
     "instances twice": read(f"{OBJECT}.instance_id", 2, "objects.instance_id: 2 twice"),
     "principal point": read(f"{RECORD}.intrinsics.cx", 999, "camera_data.intrinsics: K with"),
-    "focal length": read(f"{RECORD}.intrinsics.fx", -150, "camera_data.intrinsics: K with"),
     "aspect": read(f"{RECORD}.intrinsics.fx", 450, "camera_data.intrinsics: "),
     "size": read(f"{RECORD}.width", 640, "camera_data.size: 640×128; the image has 128×128"),
     "settings cut": Case(SETTINGS, half, f"{SETTINGS}: JSON"),
@@ -649,51 +635,18 @@ def test_report_lines_are_capped_and_counted(tmp_path, caplog):
     assert "1000 images checked, 10005 defects" in caplog.text
 
 
-def make(root, *names):
-    for name in names:
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
-
-
-SCENE_FILE = "train_pbr/000000/scene_gt.json"
-NDDS_FILES = ("000000.json", "000000.png", "_object_settings.json")
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        (
-            [f"bracket/{SCENE_FILE}", *(f"plate/{name}" for name in NDDS_FILES)],
-            r"2 data sets: bracket \(BOP\), plate \(NDDS\)",
-        ),
-        ([f"bracket/{SCENE_FILE}"], r"1 data sets: bracket \(BOP\)"),
-        (
-            [f"{item}/{name}" for item in "ab" for name in (*NDDS_FILES, RECORD_FILE)],
-            r"2 data sets: a \(NDDS\), b \(NDDS\)",
-        ),
-        (
-            [f"set{n}/{SCENE_FILE}" for n in range(10)],
-            r"10 data sets: set0 .*set7 \(BOP\) and 2 more",
-        ),
-    ],
-)
-def test_a_folder_of_data_sets_is_rejected(names, found, tmp_path):
-    make(tmp_path, *names)
-    first = min(name.split("/")[0] for name in names)
-    with pytest.raises(UserError, match=found) as error:
-        check_dataset(tmp_path)
-    assert error.value.fix.endswith(f"dopepp check {tmp_path / first}")
-
-
 def test_folders_of_scenes_are_one_data_set(tmp_path):
-    for scene in ("kitchen_0", "forest_1"):
-        make(tmp_path, *(f"{scene}/{name}" for name in NDDS_FILES))
+    for name in ("kitchen_0/000000", "forest_1/000000"):
+        (tmp_path / name).parent.mkdir()
+        for suffix in (".json", ".png"):
+            (tmp_path / f"{name}{suffix}").write_text("{}")
     assert check_dataset(tmp_path).layout == "NDDS"
 
 
-@pytest.mark.parametrize("names", [[], ["notes/readme.txt"]])
-def test_a_folder_of_unknown_layout_is_rejected(names, tmp_path):
-    make(tmp_path, *names)
-    with pytest.raises(UserError, match="a folder with an unknown layout"):
-        check_dataset(tmp_path)
+@pytest.mark.parametrize(
+    ("name", "message"), [("notes", "a folder of an unknown layout"), ("no", "not a folder")]
+)
+def test_a_folder_of_unknown_layout_is_rejected(name, message, tmp_path):
+    (tmp_path / "notes").mkdir()
+    with pytest.raises(UserError, match=message):
+        check_dataset(tmp_path / name)

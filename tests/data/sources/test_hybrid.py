@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.errors import UserError
 from dopepp.data.hybrid import VIRTUAL, HybridSource, WindowedSource
 from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import Sample, crop_sample, letterbox_sample
@@ -97,11 +96,6 @@ def test_contains_and_describe_ignore_unused_sources():
     shares = {"seed": 0, "samples_per_epoch": 10, "role": "virtual", "count": 10}
     assert info.identity["hybrid"] == shares
     assert {mix.locate(i, 0)[0] for i in range(10)} == {VIRTUAL}
-
-
-def test_a_mix_without_a_source_is_rejected():
-    with pytest.raises(UserError, match="without any source"):
-        HybridSource(None, None, 0.5, 4, 0)
 
 
 PART = pivconnector()

@@ -12,7 +12,7 @@ from dopepp.data.rendered import FIRST_INDEX, MAX_ITEMS, CachedSource, RenderedS
 from dopepp.data.sample import resize_sample
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets import PRESETS, preset_of
+from dopepp.virtual.presets import PRESETS
 from tests.data import makers
 
 
@@ -63,16 +63,6 @@ def test_bounds_description_and_objects(factory):
     assert other.identity != info.identity
 
 
-def test_clutter_settings_belong_to_the_identity():
-    def identity(**changes):
-        factory = Factory([pivconnector()], preset_of("quickstart", changes), 3)
-        (info,) = RenderedSource(factory, 4, "val").describe()
-        return info.identity
-
-    identities = identity(), identity(clutter=[0, 5]), identity(background_contrast=[0.5, 2.0])
-    assert len({each["preset"] for each in identities}) == 3
-
-
 def test_a_scale_moves_the_camera_of_the_same_test_set(factory):
     usual, near = (RenderedSource(factory, 2, "test", scale=scale) for scale in (1.0, 0.5))
     first, other = usual.sample(1), near.sample(1)
@@ -82,9 +72,6 @@ def test_a_scale_moves_the_camera_of_the_same_test_set(factory):
     ((described,), (there,)) = usual.describe(), near.describe()
     # Caches and checkpoints of the usual images stay valid.
     assert there.identity == {**described.identity, "scale": 0.5}
-    for scale in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="scale"):
-            RenderedSource(factory, 2, scale=scale)
 
 
 def assert_same(first, second):
@@ -147,7 +134,7 @@ def test_forked_processes_fill_one_cache(fake_source):
 def test_samples_that_do_not_fit_are_rejected(fake_source, monkeypatch):
     with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
         CachedSource(fake_source(num_items=10**9), (64, 64))
-    with pytest.raises(ValueError, match="more than 64 characters"):
+    with pytest.raises(ValueError, match="at most 40 instances and 64 characters"):
         CachedSource(fake_source(label="x" * 65), (64, 64))
     for change in ({"size": (48, 64)}, {"name": "another"}):
         source = fake_source()
@@ -156,7 +143,7 @@ def test_samples_that_do_not_fit_are_rejected(fake_source, monkeypatch):
         with pytest.raises(ValueError, match="one size and source"):
             cached.sample(1)
     monkeypatch.setattr(rendered, "_MAX_INSTANCES", 0)
-    with pytest.raises(ValueError, match="1 instances; at most 0"):
+    with pytest.raises(ValueError, match="1 instances, .*; at most 0 instances"):
         CachedSource(fake_source(), (64, 64))
 
 

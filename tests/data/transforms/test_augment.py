@@ -80,12 +80,3 @@ def test_blur_and_jpeg_against_opencv(image):
     harsh = only(jpeg_probability=1, jpeg_quality=(10, 10))(image, np.random.default_rng(0))
     errors = [np.abs(array.astype(int) - image).mean() for array in (mild, harsh)]
     assert 0 < errors[0] < errors[1]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"brightness": -0.1}, {"noise_sigma": (5, 1)}, {"blur_probability": 1.2}, {"hue": -1}],
-)
-def test_wrong_ranges_are_rejected(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Photometric(**options)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from dopepp.parts import servoholder
-from dopepp.parts.mesh import SurfaceTree, face_areas, largest_distance, sample_surface, weld
+from dopepp.parts.mesh import SurfaceTree, largest_distance, sample_surface, weld
 
 
 @settings(max_examples=60)
@@ -68,12 +68,6 @@ def test_largest_distance_of_one_point_outside_a_plane():
     assert largest_distance(points) == pytest.approx(np.sqrt(9.5), rel=1e-12)
 
 
-def test_face_areas_agree_with_trimesh():
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
-    areas = face_areas(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    np.testing.assert_allclose(areas, mesh.area_faces, rtol=1e-12)
-
-
 def test_samples_lie_on_the_surface():
     mesh = servoholder().mesh
     points = sample_surface(mesh.vertices, mesh.faces, num_points=300)
@@ -101,14 +95,6 @@ def test_samples_are_uniform_over_the_surface():
     face = points[on_side[:, 0]] / size
     np.testing.assert_allclose(face[:, 1:].mean(axis=0), 0, atol=0.02)
     np.testing.assert_allclose(face[:, 1:].var(axis=0), 1 / 12, atol=0.005)
-
-
-def test_samples_depend_on_the_seed_only():
-    mesh = trimesh.creation.box((1, 1, 1))
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    first, again = (sample_surface(vertices, faces) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    assert (sample_surface(vertices, faces, seed=1) != first).any()
 
 
 def test_a_face_without_area_gets_no_sample():

@@ -1,8 +1,7 @@
 """Read BOP's annotations into arrays: cameras, poses and visible fractions, in metres.
 
 A scene's ``scene_*.json`` (by image) and a shard's ``KEY.*.json`` hold the same records. A wrong
-record is reported and leaves NaN in the arrays. A scene has the folders ``rgb`` (or ``gray``),
-``depth``, ``mask`` and ``mask_visib``.
+record is reported and leaves NaN in the arrays.
 """
 
 from __future__ import annotations
@@ -25,24 +24,19 @@ from dopepp.geometry.rotation import nearest_rotation
 
 _log = logging.getLogger(__name__)
 
-MM: Final = 1000.0
-"""Millimetres per metre."""
-
-EXACT: Final = 1e-3
-"""Largest deviation of R·Rᵀ from the identity at which a rotation is kept unchanged."""
-
+MM: Final = 1000.0  # millimetres per metre
+EXACT: Final = 1e-3  # largest deviation of R·Rᵀ from the identity that is kept unchanged
 INEXACT: Final = 1e-2
 """Largest deviation at which the nearest rotation replaces a matrix; LM-O has up to 2e-3."""
 
-_ROUNDING: Final = 1e-3
-"""Distance by which a visible fraction may lie outside [0, 1]."""
-
+_ROUNDING: Final = 1e-3  # by which a visible fraction may lie outside [0, 1]
 MAX_SCENE_BYTES: Final = 128_000_000
 """Largest JSON file of a scene: 40,000 images with ten objects each."""
 
-IMAGES: Final = ("rgb", "gray"), (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-DEPTHS: Final = ("depth",), (".png", ".tif", ".tiff")
-"""Alternative folders and suffixes of a scene's images; the first existing folder is used."""
+Kind = tuple[tuple[str, ...], tuple[str, ...]]
+IMAGES: Final[Kind] = ("rgb", "gray"), (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DEPTHS: Final[Kind] = ("depth",), (".png", ".tif", ".tiff")
+"""Alternative folders, of which the first existing is used, and suffixes of a scene's images."""
 
 Record = Mapping[str, Any]
 
@@ -67,7 +61,7 @@ class BopPoses:
     inexact: Bool[np.ndarray, " objects"]
 
     def select(self, is_selected: Bool[np.ndarray, " objects"]) -> BopPoses:
-        """Return the objects for which ``is_selected`` is True."""
+        """Return the selected objects."""
         return BopPoses(*(values[is_selected] for values in vars(self).values()))
 
     def without_model(self, models: Collection[int]) -> Counter[int]:
@@ -89,12 +83,9 @@ def read_cameras(
 
 
 def pair_infos(truths: Sequence[Record], entry: object, node: Node) -> list[Record | None]:
-    """Return the ``gt_info`` record of each object of an image; None if missing.
+    """Return each object's ``gt_info`` record of an image's ``entry`` at ``node``; None if missing.
 
-    Args:
-        truths: The image's ``gt`` records.
-        entry: The image's ``gt_info`` entry; null and an empty list count as missing.
-        node: The entry's node.
+    An entry of null or an empty list counts as missing.
     """
     if entry is None or entry == []:
         return [None] * len(truths)
@@ -109,10 +100,8 @@ def pair_infos(truths: Sequence[Record], entry: object, node: Node) -> list[Reco
 def read_poses(truths: Sequence[Record], infos: Sequence[Record | None], nodes: Nodes) -> BopPoses:
     """Return the objects of ``gt`` and ``gt_info`` records; report wrong values and make them NaN.
 
-    Args:
-        truths: Records with ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
-        infos: Each object's record, which may have ``visib_fract``, or None.
-        nodes: Nodes of the records.
+    A truth has ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``; an info may have
+    ``visib_fract``.
     """
     node, info_node = partial(nodes, "gt"), partial(nodes, "gt_info")
     rotations = _column(truths, "cam_R_m2c", 9, node).reshape(-1, 3, 3)
@@ -217,16 +206,8 @@ def _by_image(node: Node) -> dict[int, Any]:
     return by_image
 
 
-def image_files(
-    scene: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], problems: Problems = STRICT
-) -> dict[int, Path]:
-    """Return the files of a scene's colour or depth images by image number.
-
-    Args:
-        scene: Folder of the scene.
-        kind: :data:`IMAGES` or :data:`DEPTHS`, the allowed folders and suffixes.
-        problems: Receiver of the problem that an image is present twice.
-    """
+def image_files(scene: Path, kind: Kind, problems: Problems = STRICT) -> dict[int, Path]:
+    """Return a scene's colour (:data:`IMAGES`) or depth files by number; report repeated ones."""
     folders, suffixes = kind
     folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
     files: dict[int, Path] = {}
@@ -278,10 +259,8 @@ class BopScene:
 def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> BopScene:
     """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
 
-    Args:
-        folder: Folder of the scene.
-        wanted: Numbers of the objects to keep.
-        with_model: Numbers of the objects with a model; empty in a data set without models.
+    Only objects in ``wanted`` are kept. ``with_model`` holds the objects with a model, and is empty
+    in a data set without models.
     """
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)
@@ -289,13 +268,13 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
         problem = f"ignoring {len(without_camera)} images with ground truth but without a camera"
         _log.warning("%s: %s; first: %d", folder, problem, min(without_camera))
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
+    owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 
     def nodes(record_kind: str, number: int) -> Node:
         node = Node(STRICT, folder / f"scene_{record_kind}.json")
-        if record_kind == "camera":
-            return node[f"{images[number]}"]
-        row, n = owners[number]
-        return node[f"{images[row]}"][n]
+        row, *n = (number,) if record_kind == "camera" else owners[number]
+        node = node[f"{images[row]}"]
+        return node[n[0]] if n else node
 
     K, scales = read_cameras([cameras[i] for i in images], nodes)
     poses = read_poses(
@@ -324,12 +303,6 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     )
 
 
-def _relative_files(
-    folder: Path, kind: tuple[tuple[str, ...], tuple[str, ...]], images: Sequence[int]
-) -> list[str]:
-    """Return each image's path relative to the scene folder; empty if the file is missing.
-
-    ``kind`` is :data:`IMAGES` or :data:`DEPTHS`.
-    """
+def _relative_files(folder: Path, kind: Kind, images: Sequence[int]) -> list[str]:
     files = image_files(folder, kind)
     return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]

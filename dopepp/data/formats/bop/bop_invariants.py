@@ -1,9 +1,7 @@
 """Check that the records, models, masks and images of a BOP data set agree.
 
 The reader parses the records, and its problems are defects. Optional files (depth, masks) must
-exist for every image of a scene or for none. The report notes scenes without ``scene_gt.json``
-(the ground truth of tests may be private), objects without ``visib_fract`` or a model, and inexact
-rotations.
+exist for every image of a scene or for none. What every reader handles is noted.
 """
 
 from __future__ import annotations
@@ -35,19 +33,14 @@ from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 
 DIAMETERS_MM: Final = (5.0, 5000.0)
-
-FRACTION_TOLERANCE: Final = 0.05
-"""Allowed difference of ``visib_fract`` from the quotient of the pixel counts."""
-
+FRACTION_TOLERANCE: Final = 0.05  # difference of visib_fract from the quotient of the pixel counts
 PIXEL_TOLERANCE: Final = 0.01
 """Allowed difference of ``px_count_visib`` from a mask's pixels, a share (plus a border row)."""
 
 BOX_EDGE_PX: Final = 2.0
 """Allowed distance of ``bbox_visib`` from the mask's box: some tools exclude the last pixel."""
 
-_ROUNDING: Final = 1.001
-"""Allowed factor between a diameter and its box, which are rounded to a few digits."""
-
+_ROUNDING: Final = 1.001  # factor between a diameter and its box, rounded to a few digits
 _CAMERA, _TRUTH, _INFO = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
 _MASKS: Final = ("mask", "mask_visib")
 
@@ -68,7 +61,6 @@ def scene_folders(root: Path) -> Iterator[Path]:
 
 
 def _is_scene(folder: Path) -> bool:
-    """Return whether a folder has a scene's JSON file, or a numeric name and a folder ``rgb``."""
     named = folder.name.isdecimal() and (folder / "rgb").is_dir()
     return named or any((folder / name).is_file() for name in (_CAMERA, _TRUTH, _INFO))
 
@@ -93,7 +85,7 @@ class _SceneCheck:
         self._records = bop.read_records(folder, report)
         self._has_truth = (folder / _TRUTH).is_file()
 
-    def _image_files(self, kind: tuple[tuple[str, ...], tuple[str, ...]]) -> dict[int, Path]:
+    def _image_files(self, kind: bop.Kind) -> dict[int, Path]:
         """Return colour or depth images by number; report images without a numeric name."""
         files = bop.image_files(self._folder, kind, self._report)
         for folder in {path.parent for path in files.values()}:
@@ -149,20 +141,14 @@ class _SceneCheck:
             mask = decode_one_channel(Node(report, path), shape)
             return None if mask is None else mask != 0
 
+        infos_of_image = infos.get(image, [None] * len(objects))
+        has_depth, camera = bool(self._depths), cameras.get(image)
         return check_image(
-            nodes,
-            cameras.get(image),
-            objects,
-            infos.get(image, [None] * len(objects)),
-            shape,
-            bool(self._depths),
-            self._models,
-            read_mask,
+            nodes, camera, objects, infos_of_image, shape, has_depth, self._models, read_mask
         )
 
 
 def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
-    """Return the paths of the masks in a folder by image number and object index."""
     files: dict[int, dict[int, Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         image, _, number = path.stem.partition("_")
@@ -180,7 +166,7 @@ class Deviations:
     without_model: Counter[int] = field(default_factory=Counter)
 
     def count(self, poses: BopPoses, models: ModelSizes | None) -> None:
-        """Count the deviations of an image's annotation."""
+        """Count an image's deviations."""
         self.inexact += int(poses.inexact.sum())
         self.without_fraction += int(np.isnan(poses.visible_fractions).sum())
         self.without_model += poses.without_model(models or ())
@@ -213,8 +199,7 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> ModelSizes | None
     """Check the first ``models*/models_info.json`` below one of the folders, and its meshes.
 
     Returns:
-        Sizes of the objects with a mesh, or of all objects if none has a mesh; None without a
-        readable file.
+        Sizes of the objects with a mesh (of all if none has one); None without a readable file.
     """
     path = next(filter(None, map(info_path, roots)), None)
     if path is None:
@@ -240,10 +225,7 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> ModelSizes | None
 
 
 def _model(node: Node, record: object, stated: float) -> ModelSize:
-    """Check a model's record in ``models_info.json``; return its size without implausible values.
-
-    ``stated`` is the diameter in the record, metres; NaN if it is missing.
-    """
+    """Check a model's record with the ``stated`` diameter (metres, or NaN); return its size."""
     fields, diameter = mapping(record), None if np.isnan(stated) else stated
     if fields and "diameter" not in fields:
         node["diameter"].report("missing")
@@ -279,15 +261,8 @@ def check_image(
 ) -> BopPoses:
     """Check camera, poses, boxes, counts and masks of one image; return the poses.
 
-    Args:
-        nodes: Nodes of the records.
-        camera: The image's camera record; None if it is missing.
-        truths: The objects' ``gt`` records.
-        infos: The objects' ``gt_info`` records.
-        shape: (height, width) of the image; None if it cannot be read.
-        has_depth: Whether the camera must state the scale of a depth image.
-        models: Sizes by object number; None without models.
-        read_mask: Reader of the objects' masks.
+    ``camera`` is the image's record, or None if it is missing; ``shape`` is None for an unreadable
+    image. With ``has_depth``, the camera must state the scale of a depth image.
     """
     K = None if camera is None else _check_camera(nodes, camera, shape, has_depth)
     poses = bop.read_poses(truths, infos, nodes)
@@ -314,7 +289,6 @@ def check_image(
 def _check_camera(
     nodes: Nodes, camera: object, shape: Shape | None, has_depth: bool
 ) -> CameraMatrix | None:
-    """Check an image's camera record; return K, or None if K is missing or implausible."""
     node = nodes("camera", 0)
     K: CameraMatrix = bop.read_cameras([camera], nodes)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):

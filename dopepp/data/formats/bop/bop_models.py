@@ -1,7 +1,7 @@
 """Read and write BOP's object models: ``obj_000001.ply`` and ``models_info.json``, millimetres.
 
-In addition to BOP's keys, ``models_info.json`` has the part's ``name``, which other tools ignore.
-An object without a name is named after its file, ``obj_000001``.
+In addition to BOP's keys, ``models_info.json`` may have the part's ``name``. Otherwise an object is
+named after its file.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_file
+from dopepp.core.files import encode_image, write_file
 from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number
-from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.geometry.rotation import is_rotation, nearest_rotation
@@ -39,15 +38,13 @@ MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
 INFO_FILE: Final = "models_info.json"
 
 SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
-
 Symmetries = dict[str, Any]
 """The two :data:`SYMMETRY_FIELDS` as arguments of :class:`~dopepp.parts.part.Part`: rigid
 transforms without the identity (None if there are none), and (axis, offset) pairs; metres."""
 
 _ALLOWED: Final = 'objects by number, each once: {"1": {"diameter": …}, …}'
 
-_DIAMETER_TOLERANCE: Final = 0.01
-"""Allowed relative difference between the stated diameter and the mesh's diameter."""
+_DIAMETER_TOLERANCE: Final = 0.01  # relative difference of the stated from the mesh's diameter
 
 
 @dataclass(frozen=True)
@@ -63,10 +60,8 @@ class ModelInfo:
 def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Part]:
     """Make parts, with their symmetries, from the models of a BOP data set.
 
-    Args:
-        root: Folder of the data set.
-        objects: Names, or stems of the model files (``obj_000001``), in the requested order
-            (default: all objects with a file, by number).
+    ``objects`` are names, or stems of the model files (``obj_000001``), in the requested order
+    (default: all objects with a file, by number).
 
     Raises:
         UserError: The folder has no models, or a name is unknown.
@@ -97,8 +92,8 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     """Return the parts by BOP object ID.
 
     Raises:
-        UserError: A part is not in ``models_info.json``. If this file is missing, the part's name
-            is not of the form ``obj_000001``.
+        UserError: A part is not in ``models_info.json`` or, without this file, not named like
+            ``obj_000001``.
     """
     infos = read_models(root)
     names = {info.name: number for number, info in infos.items()}
@@ -137,11 +132,7 @@ def model_numbers(names: Sequence[str]) -> dict[str, int]:
 
 
 def read_part(info: ModelInfo) -> Part:
-    """Make a part from an object's mesh.
-
-    Raises:
-        UserError: The mesh is missing, damaged or not in millimetres.
-    """
+    """Make a part from an object's mesh, which must be in millimetres."""
     mesh = read_mesh(info.path, unit="mm")
     try:
         part = make_part(info.name, mesh, unit="mm", **info.symmetries)
@@ -194,7 +185,6 @@ def parse_models(path: Path, records: object, problems: Problems = STRICT) -> di
 
 
 def _info(node: Node, model: Path, record: object) -> ModelInfo:
-    """Parse an object's record in ``models_info.json``; ``model`` is the path of its mesh."""
     if not isinstance(record, dict):
         node.report(f"{record!r:.60}", "an object with diameter and symmetries")
     fields, diameter = mapping(record), math.nan
@@ -213,11 +203,7 @@ def _symmetries(node: Node, fields: Mapping[str, Any]) -> Symmetries:
 
 
 def parse_symmetries(name: str, fields: object) -> Symmetries:
-    """Return the symmetries in a config's entry, in the format of ``models_info.json``.
-
-    Raises:
-        UserError: The entry has other fields, or a value is not a rigid transform or axis.
-    """
+    """Return the symmetries in a config's entry, in the format of ``models_info.json``."""
     node = Node(STRICT, f"data.symmetries.{name}")
     if not isinstance(fields, Mapping) or not {*fields} <= {*SYMMETRY_FIELDS}:
         node.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as in BOP")
@@ -293,7 +279,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
         assert part.mesh is not None
         write_file(model, ply_bytes(part.mesh, texture.name))
         if part.mesh.texture is not None:
-            write_file(texture, encode_png(part.mesh.texture))
+            write_file(texture, encode_image(part.mesh.texture))
     write_file(path, content)
 
 
@@ -322,18 +308,16 @@ def ply_bytes(mesh: Mesh, texture_name: str) -> bytes:
 
     # Weighted by the faces' angles at the vertex, like BOP's normals (Thürmer, Wüthrich 1998).
     normals = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
-    columns = [mesh.vertices * MM, np.asarray(normals)]
-    names = ["x", "y", "z", "nx", "ny", "nz"]
+    columns = {"x y z": mesh.vertices * MM, "nx ny nz": np.asarray(normals)}
     has_texture = mesh.texture is not None and mesh.uv is not None
     if has_texture:
-        names += ["texture_u", "texture_v"]
-        columns.append(np.asarray(mesh.uv))
+        columns["texture_u texture_v"] = np.asarray(mesh.uv)
+    names = " ".join(columns).split()
     channels = () if mesh.colours is None else ("red", "green", "blue")
-    values = np.hstack(columns).astype("<f4")
     vertices = np.empty(
-        len(values), [("numbers", "<f4", values.shape[1]), ("colour", "u1", len(channels))]
+        len(mesh.vertices), [("numbers", "<f4", len(names)), ("colour", "u1", len(channels))]
     )
-    vertices["numbers"] = values
+    vertices["numbers"] = np.hstack(list(columns.values()))
     if mesh.colours is not None:
         vertices["colour"] = mesh.colours
     faces: NDArray[Any] = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])

@@ -33,8 +33,6 @@ from dopepp.parts.part import Part
 _log = logging.getLogger(__name__)
 
 TARGETS_FILE: Final = "test_targets_bop19.json"
-"""The list of targets that BOP publishes."""
-
 AUTO: Final = "auto"
 """Value of ``targets``: :data:`TARGETS_FILE` for a split like ``test_primesense``, if present."""
 
@@ -54,11 +52,7 @@ Targets = dict[tuple[int, int], Counter[int] | None]
 
 
 def read_targets(path: Path) -> Targets:
-    """Return the instances to find that a file like ``test_targets_bop19.json`` lists.
-
-    Raises:
-        UserError: The file holds no list of targets with ``scene_id`` and ``im_id``.
-    """
+    """Return the instances to find that a file like ``test_targets_bop19.json`` lists."""
     records = parse(list[_Target], read_json(path), f"{path}", "download the file again")
     if not records:
         raise UserError(f"{path}, an empty list", "a list of targets", "download the file again")
@@ -75,20 +69,17 @@ def read_targets(path: Path) -> Targets:
 class BopReader:
     """Reader of the images of a split, ordered by scene and image number.
 
-    The constructor reads the scenes' JSON files and checks every record, but no image. An
-    image without ground truth has no instances. The reader ignores and counts objects that are not
-    among the parts or lie behind the camera (rendered sets have some). The visible fraction
-    is ``visib_fract`` of ``scene_gt_info.json``, or an estimate of
-    :func:`~dopepp.data.formats.make_instance`.
+    The constructor reads and checks the scenes' JSON files, but no image. An image without ground
+    truth has no instances. Objects that are not among the parts or lie behind the camera are
+    ignored and counted. The visible fraction is ``visib_fract`` of ``scene_gt_info.json``, or an
+    estimate of :func:`~dopepp.data.formats.make_instance`.
 
     Args:
         parts: Objects to return, named as in ``models_info.json`` or ``obj_000001``.
         split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
         targets: File in ``root`` that selects images and the number of instances of each object,
-            e.g. ``test_targets_bop19.json``. Of an object's instances, the most visible are
-            targets. ``auto`` uses ``test_targets_bop19.json`` if it exists.
-        part_of: Consecutive share of the images as (first, last) fractions, so that disjoint
-            shares of a folder serve training, validation and test.
+            of which the most visible are targets; :data:`AUTO` for BOP's file.
+        part_of: Consecutive share of the images as (first, last) fractions.
     """
 
     def __init__(
@@ -115,7 +106,6 @@ class BopReader:
         self._log_deviations(with_model)
 
     def _find_items(self) -> list[tuple[BopScene, int]]:
-        """Return the scene, and the row in the scene, of each selected image on disk, in order."""
         listed = [
             (scene, row)
             for scene in self._scenes
@@ -163,7 +153,6 @@ class BopReader:
             _log.warning("%s: %s %s", self.name, f"{lacking:,}", problem)
 
     def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
-        """Return the numbers of instances to find on an image by object number; None for all."""
         assert self._targets is not None
         return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
 
@@ -198,7 +187,6 @@ class BopReader:
     def _instance(
         self, scene: BopScene, k: int, stem: str, K: CameraMatrix, shape: Shape
     ) -> Instance:
-        """Return object ``k`` of a scene as an instance of an image, with its mask if stored."""
         path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
         mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
         poses, part = scene.poses, self._parts[int(scene.poses.obj_ids[k])]
@@ -206,7 +194,6 @@ class BopReader:
         return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
     def _depth(self, scene: BopScene, row: int, shape: Shape) -> DepthMap | None:
-        """Read an image's depth in metres; None in a scene without depth images."""
         if not any(scene.depth_files):
             return None
         expected = f"depth/{scene.image_ids[row]:06d}.png"
@@ -253,7 +240,6 @@ class BopReader:
 
     @cached_property
     def _num_instances(self) -> dict[str, int]:
-        """Numbers of instances on the selected images by part name."""
         counts: Counter[int] = Counter()
         for scene, row in self._items:
             counts.update(scene.poses.obj_ids[scene.objects(row)].tolist())
@@ -261,7 +247,6 @@ class BopReader:
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:
-    """Return a split's scenes in order, i.e. the folders whose names are numbers."""
     if not (root / split).is_dir():
         splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
         raise UserError(

@@ -1,8 +1,7 @@
 """Write poses as a BOP challenge CSV, and read the CSV of any method.
 
 Lines are ``scene_id,im_id,obj_id,score,R,t,time``. R (row by row) and t (millimetres) are numbers
-between spaces; time is in seconds for the whole image, −1 if unknown. BOP's name of the file is
-``METHOD_DATASET-SPLIT.csv``.
+between spaces; time is in seconds for the whole image, −1 if unknown.
 """
 
 from __future__ import annotations
@@ -27,17 +26,13 @@ from dopepp.geometry.rotation import is_rotation
 FIELDS: Final = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 UNKNOWN_TIME: Final = -1.0
 
-MAX_ROWS: Final = 500_000
-"""Several times the largest submission; a row takes 0.8 kB of memory."""
-
+MAX_ROWS: Final = 500_000  # several times the largest submission; a row takes 0.8 kB of memory
 _MAX_LINE_BYTES: Final = 4096  # fourteen numbers of 25 digits take 400
 _FARTHEST: Final = 1e9  # mm; the square is finite
-
 _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
 """Range of the median distance from the camera; a median outside means another unit."""
 
 _COUNTS: Final = {"score": 1, "R": 9, "t": 3, "time": 1}
-
 Table = Float[np.ndarray, "rows 18"]
 """Per pose, the number of its line in the file and the line's 17 numbers."""
 
@@ -79,14 +74,10 @@ def write_results(path: Path, results: Sequence[BopResult]) -> None:
 def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
     """Read a results file; the header is optional, and blank lines are skipped.
 
-    Args:
-        path: The CSV file.
-        objects: Numbers of the data set's objects.
-
     Raises:
         UserError: The file is missing, not text, or has more than 500,000 poses; a line is damaged
-            or repeated, or has an unknown object; R is not a rotation within 1e-3; or t is not in
-            millimetres.
+            or repeated, or its object is not in ``objects``; R is not a rotation within 1e-3; or t
+            is not in millimetres.
     """
     values = array("d")
     for number, text in _lines(path):
@@ -106,7 +97,6 @@ def read_results(path: Path, objects: Collection[int]) -> list[BopResult]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the number and text of each line with a pose."""
     allowed = f"a CSV file of {','.join(FIELDS)}"
     if not path.is_file():
         raise _error(f"{path}, no such file", allowed, "pass the path of an existing file")
@@ -147,7 +137,6 @@ def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
 
 
 def _numbers(name: str, field: str, where: str) -> list[float]:
-    """Return the numbers of a field, or raise a UserError for a wrong count or value."""
     words, count = field.split(), _COUNTS[name]
     if len(words) != count:
         noun = "number" if count == 1 else "numbers between spaces"
@@ -170,7 +159,6 @@ def _numbers(name: str, field: str, where: str) -> list[float]:
 
 
 def _check_repeats(path: Path, table: Table) -> None:
-    """Raise a UserError if two lines differ only in the time."""
     keys = table[:, 1:17]
     order = np.lexsort(keys.T[::-1])  # stable: equal rows keep the order of lines
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
@@ -182,7 +170,6 @@ def _check_repeats(path: Path, table: Table) -> None:
 
 
 def _check_unit(path: Path, table: Table) -> None:
-    """Raise a UserError if the median distance from the camera is implausible in millimetres."""
     if not len(table):
         return
     distances = np.linalg.norm(table[:, 14:17], axis=1)

@@ -1,16 +1,16 @@
 """Write BOP's scenewise layout item by item, and finalize it scene by scene.
 
-``train_pbr/000012/`` holds images 12,000 – 12,999: rgb, depth, mask and mask_visib as PNG, and
-``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json``. The scene's hidden folder
-``.items`` keeps an image's records until the scene is finalized. :func:`make_labels` defines the
-records as BOP's toolkit does.
+``train_pbr/000012/`` holds images 12,000 – 12,999. The scene's hidden folder ``.items`` keeps an
+image's records until the scene is finalized.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ from jaxtyping import UInt16
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_file
+from dopepp.core.files import encode_image, write_file
 from dopepp.core.json import read_json
 from dopepp.data.formats import (
     STAGING,
@@ -33,7 +33,7 @@ from dopepp.data.formats import (
 )
 from dopepp.data.formats.bop import MAX_SCENE_BYTES, MM
 from dopepp.data.formats.bop.bop_models import INFO_FILE, MODEL_FOLDERS, model_numbers, write_models
-from dopepp.data.formats.images import depth_units, encode_png
+from dopepp.data.formats.images import depth_units
 from dopepp.data.formats.invariants import Box
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask
@@ -43,9 +43,6 @@ from dopepp.virtual.renderers.raster import Silhouette, silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
-IMAGES_A_SCENE: Final = 1000
-"""Number of images in a scene, as in the rendered training sets of BOP."""
-
 SCENE_FIELDS: Final = ("gt", "gt_info", "camera")
 """Fields of a staged item, each for a file ``scene_FIELD.json``. The cameras list the finalized
 images, so their file is written last."""
@@ -53,13 +50,29 @@ images, so their file is written last."""
 Record = dict[str, Any]
 
 
-class BopFolder:
-    """Base of writers of a BOP data set: models, numbered by :func:`model_numbers`, and a split."""
+class BopFolder(ABC):
+    """Base of writers of a BOP data set: models, numbered by :func:`model_numbers`, and a split.
 
-    chunk_size = IMAGES_A_SCENE
+    Each item is staged as ``NUMBER`` and :attr:`suffix`, until its chunk is finalized.
+    """
+
+    chunk_size = 1000  # images in a scene, as in the rendered training sets of BOP
+    suffix: str
 
     def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
         self.root, self.split, self._parts = Path(root), split, tuple(parts)
+
+    @abstractmethod
+    def staging(self, chunk: int) -> Path:
+        """Return the folder of a chunk's staged items."""
+
+    @abstractmethod
+    def finalized(self, chunk: int) -> Iterable[int]:
+        """Return the numbers of a chunk's finalized images."""
+
+    @abstractmethod
+    def merge(self, chunk: int, staged: Mapping[int, Path]) -> None:
+        """Add staged images, by number, to the files of a chunk."""
 
     def prepare(self) -> None:
         """Write the parts' models, if they are not there yet.
@@ -74,9 +87,31 @@ class BopFolder:
             raise UserError(problem, allowed, "pass another folder")
         write_models(self.root, self._parts)
 
+    def written(self, chunk: int) -> set[int]:
+        """Return the indices of the chunk's images that are staged or finalized."""
+        images = {*self._staged(chunk), *self.finalized(chunk)}
+        return {chunk * self.chunk_size + image for image in images}
+
+    def finalize(self, chunk: int, indices: Sequence[int]) -> None:
+        """Merge the staged images of a chunk into its files."""
+        image_numbers = {index % self.chunk_size for index in indices}
+        # The hidden folder of all chunks or of this chunk.
+        staging = self.staging(chunk)
+        with lock_staging(staging if staging.name == STAGING else staging.parent):
+            staged = self._staged(chunk)
+            staged = {image: path for image, path in staged.items() if image in image_numbers}
+            self.merge(chunk, staged)
+            for path in staged.values():
+                path.unlink()
+            if staging.name != STAGING:
+                with suppress(OSError):  # the folder is missing, or has items left
+                    staging.rmdir()
+
+    def _staged(self, chunk: int) -> dict[int, Path]:
+        return {int(path.stem): path for path in staged_items(self.staging(chunk), self.suffix)}
+
     @cached_property
     def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
-        """Each part and its surface by name, for parts with a mesh."""
         return {part.name: (part, make_surface(part.mesh)) for part in self._parts if part.mesh}
 
     def labels(self, sample: Sample) -> Labels:
@@ -88,50 +123,44 @@ class BopFolder:
 class BopWriter(BopFolder):
     """A :class:`~dopepp.data.formats.Writer` of the scenewise layout."""
 
-    name = "bop"
+    name, suffix = "bop", ".json"
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an image's files, last the staged records, which mark it as complete."""
         labels = self.labels(sample)
         chunk, image = divmod(index, self.chunk_size)
         scene = self._scene(chunk)
-        write_file(scene / "rgb" / f"{image:06d}.png", encode_png(sample.image))
-        write_file(scene / "depth" / f"{image:06d}.png", encode_png(labels.depth))
+        write_file(scene / "rgb" / f"{image:06d}.png", encode_image(sample.image))
+        write_file(scene / "depth" / f"{image:06d}.png", encode_image(labels.depth))
         for folder, masks in (("mask", labels.masks), ("mask_visib", labels.visible_masks)):
             for number, mask in enumerate(masks):
                 path = scene / folder / f"{image:06d}_{number:06d}.png"
-                write_file(path, encode_png(mask.astype("uint8") * 255))
+                write_file(path, encode_image(mask.astype("uint8") * 255))
         item = {"camera": labels.camera, "gt": labels.truths, "gt_info": labels.infos}
-        stage_item(scene / STAGING / f"{image:06d}.json", json.dumps(item).encode())
+        stage_item(self.staging(chunk) / f"{image:06d}.json", json.dumps(item).encode())
 
-    def written(self, chunk: int) -> set[int]:
-        """Return the indices of the scene's images that are staged or finalized."""
-        scene = self._scene(chunk)
-        images = {int(path.stem) for path in _staged_files(scene)}
-        cameras = read_object(scene / "scene_camera.json", MAX_SCENE_BYTES)
-        images |= {int(image) for image in cameras}
-        return {chunk * self.chunk_size + image for image in images}
+    def staging(self, chunk: int) -> Path:
+        """Return the folder of a scene's staged records."""
+        return self._scene(chunk) / STAGING
 
-    def finalize(self, chunk: int, indices: Sequence[int]) -> None:
-        """Merge staged records into the scene's files, and write the data set's ``camera.json``."""
-        scene = self._scene(chunk)
-        image_numbers = {index % self.chunk_size for index in indices}
-        with lock_staging(scene / STAGING):
-            staged = [path for path in _staged_files(scene) if int(path.stem) in image_numbers]
-            items: dict[int, Any] = {int(path.stem): read_json(path) for path in staged}
-            for field in SCENE_FIELDS:
-                path = scene / f"scene_{field}.json"
-                merged = read_object(path, MAX_SCENE_BYTES)
-                merged |= {f"{image}": item[field] for image, item in items.items()}
-                # Sorted, so that the bytes do not depend on the order of writing.
-                merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
-                if items:
-                    write_file(path, encode_by_key(merged))
-            if items:
-                image, camera = next(iter(merged.items()))
-                self._write_camera(chunk, int(image), camera)
-            for path in staged:
-                path.unlink()
+    def finalized(self, chunk: int) -> Iterable[int]:
+        """Return the images in ``scene_camera.json``, which is written last."""
+        return map(int, read_object(self._scene(chunk) / "scene_camera.json", MAX_SCENE_BYTES))
+
+    def merge(self, chunk: int, staged: Mapping[int, Path]) -> None:
+        """Add staged records to the scene's files, and write the data set's ``camera.json``."""
+        if not staged:
+            return
+        items: dict[int, Any] = {image: read_json(path) for image, path in staged.items()}
+        for field in SCENE_FIELDS:
+            path = self._scene(chunk) / f"scene_{field}.json"
+            merged = read_object(path, MAX_SCENE_BYTES)
+            merged |= {f"{image}": item[field] for image, item in items.items()}
+            # Sorted, so that the bytes do not depend on the order of writing.
+            merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
+            write_file(path, encode_by_key(merged))
+        image, camera = next(iter(merged.items()))
+        self._write_camera(chunk, int(image), camera)
 
     def _scene(self, chunk: int) -> Path:
         return self.root / self.split / f"{chunk:06d}"
@@ -147,10 +176,6 @@ class BopWriter(BopFolder):
         record = {"cx": K[2], "cy": K[5], "depth_scale": camera["depth_scale"]}
         record |= {"fx": K[0], "fy": K[4], "height": height, "width": width}
         write_file(self.root / "camera.json", (json.dumps(record, indent=2) + "\n").encode())
-
-
-def _staged_files(scene: Path) -> list[Path]:
-    return staged_items(scene / STAGING, ".json")
 
 
 @dataclass(frozen=True)
@@ -176,16 +201,12 @@ class Labels:
 def make_labels(
     sample: Sample, object_ids: Mapping[str, int], parts: Mapping[str, tuple[Part, Surface]]
 ) -> Labels:
-    """Return a sample's annotation as BOP's toolkit defines it.
+    """Return the annotation of a rendered image, as BOP's toolkit defines it.
 
     A box is (x, y, width, height). Width and height are differences between the coordinates of the
     outermost pixels, so that a single pixel has width 0. The box of an object without a visible
-    pixel consists of −1. The silhouette includes pixels beyond the image's border.
-
-    Args:
-        sample: A rendered image, with depth and a mask of each instance.
-        object_ids: BOP object IDs by label.
-        parts: Parts and surfaces by label.
+    pixel consists of −1. The silhouette includes pixels beyond the image's border. ``object_ids``
+    and ``parts`` are by label.
     """
     visible = [instance.mask for instance in sample.instances if instance.mask is not None]
     assert sample.depth is not None

@@ -1,9 +1,8 @@
 """Find and parse the files of an NDDS or FAT data set.
 
 An item is ``STEM.json`` with an image ``STEM.png`` or ``STEM.jpg``; ``STEM`` is ``000000`` (NDDS)
-or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
-``_object_settings.json`` and ``_camera_settings.json``; otherwise the settings in the data set's
-folder apply. The readme of Falling Things (Tremblay et al., 2018) documents the formats.
+or ``000000.left`` (FAT). Each folder may hold settings (``_*.json``); otherwise those in the data
+set's folder apply. The readme of Falling Things (Tremblay et al., 2018) documents the formats.
 """
 
 from __future__ import annotations
@@ -30,14 +29,12 @@ OBJECT_SETTINGS: Final = "_object_settings.json"
 CAMERA_SETTINGS: Final = "_camera_settings.json"
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 
-MAX_ITEM_BYTES: Final = 16_000_000
-"""Largest annotation file; a hundred objects take 0.5 MB."""
-
+MAX_ITEM_BYTES: Final = 16_000_000  # an annotation file; a hundred objects take 0.5 MB
 DEPTH_UNIT: Final = 0.0001
 """Metres per value of a 16-bit ``.depth.png`` of FAT and of the writer; 0 is unknown."""
 
-_NORM_TOLERANCE: Final = 0.1
-"""Allowed deviation of a quaternion's norm from 1."""
+_NORM_TOLERANCE: Final = 0.1  # allowed deviation of a quaternion's norm from 1
+
 
 Objects = list[tuple[Node, Mapping[str, Any], str]]
 """(node, JSON object, class name) of every object of an annotation."""
@@ -177,33 +174,31 @@ class NddsSettings:
         """
         node = Node(problems, annotation, "camera_data.intrinsics")
         intrinsics = mapping(record.get("camera_data")).get("intrinsics")
-        if isinstance(intrinsics, dict):
-            return _intrinsics(intrinsics, node)
-        path, settings = self._of(annotation, CAMERA_SETTINGS)
-        side = annotation.name.removesuffix(".json").rpartition(".")[2]
-        cameras = _entries(settings, "camera_settings")
-        cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
-        if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
-            settings_node = Node(problems, path, "camera_settings[].intrinsic_settings")
-            return _intrinsics(cameras[0]["intrinsic_settings"], settings_node)
-        # An unreadable settings file is reported once, not for each image.
-        files = annotation.with_name(CAMERA_SETTINGS), self._root / CAMERA_SETTINGS
-        if not any(file.is_file() and self.read(file) is None for file in files):
-            allowed = (
-                f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in {path.name}"
-            )
-            node.report(f"{len(cameras)} cameras that match", allowed)
-        return np.full((3, 3), np.nan)
+        if not isinstance(intrinsics, dict):
+            path, settings = self._of(annotation, CAMERA_SETTINGS)
+            side = annotation.name.removesuffix(".json").rpartition(".")[2]
+            cameras = _entries(settings, "camera_settings")
+            cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
+            stated = [camera.get("intrinsic_settings") for camera in cameras]
+            if len(stated) != 1 or not isinstance(stated[0], dict):
+                # An unreadable settings file is reported once, not for each image.
+                files = annotation.with_name(CAMERA_SETTINGS), self._root / CAMERA_SETTINGS
+                if not any(file.is_file() and self.read(file) is None for file in files):
+                    where = f"of one camera or one named {side!r}, in {path.name}"
+                    allowed = f"fx, fy, cx, cy there or, {where}"
+                    node.report(f"{len(cameras)} cameras that match", allowed)
+                return np.full((3, 3), np.nan)
+            intrinsics = stated[0]
+            node = Node(problems, path, "camera_settings[].intrinsic_settings")
+        values = [intrinsics.get(name) for name in ("fx", "fy", "cx", "cy")]
+        return camera_matrix(*node.numbers(values, 4))
 
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
         """Return a class's ``fixed_model_transform`` as a rigid 4×4 matrix for column vectors.
 
         The matrix maps the mesh into the object frame; its translation is in the file's unit. The
         file stores the transpose of this matrix, with a rotation multiplied by the ratio of the
-        units of mesh and file, e.g. 100 for metres and centimetres.
-
-        Returns:
-            The matrix, or None if the file has no matrix of a rotation, a scale and a translation.
+        units of mesh and file, e.g. 100 for metres and centimetres. None without such a matrix.
         """
         for matrix in self._arrays(annotation, label, "fixed_model_transform", 4, 4):
             rigid = matrix.T
@@ -232,7 +227,6 @@ class NddsSettings:
         return {str(name) for name in listed} if isinstance(listed, list) else None
 
     def _objects(self, annotation: Path, label: str) -> list[dict[str, Any]]:
-        """Return the entries of a class in ``_object_settings.json``."""
         entries = _entries(self._of(annotation, OBJECT_SETTINGS)[1], "exported_objects")
         return [entry for entry in entries if entry.get("class") == label]
 
@@ -246,23 +240,14 @@ class NddsSettings:
 
 
 def _entries(settings: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    """Return the objects in a list of a settings file; empty if the list is missing."""
     rows = settings.get(name)
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
-def _intrinsics(values: Mapping[str, Any], node: Node) -> CameraMatrix:
-    """Return K from ``fx``, ``fy``, ``cx`` and ``cy`` in pixels; NaN if a number is missing."""
-    return camera_matrix(*node.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
-
-
 def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
-    """Read an item's depth image, metres along z; None if it is missing or its unit is unknown.
+    """Read an item's depth image of ``shape``, metres along z.
 
-    Args:
-        record: The annotation, which may state the unit.
-        annotation: Path of the annotation; FAT's file names also imply a unit.
-        shape: (height, width) of the image.
+    None if it is missing, or if neither the annotation nor FAT's file names imply its unit.
     """
     unit = convention_entry(record, "depth_unit_m")
     if unit is None and annotation.name.endswith((".left.json", ".right.json")):

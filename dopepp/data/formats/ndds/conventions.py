@@ -3,9 +3,8 @@
 ``quaternion_xyzw`` holds x, y, z, w or w, x, y, z; lengths are centimetres (NDDS, FAT), metres
 (nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's. Poses refer to
 the mesh frame or to a frame into which ``fixed_model_transform`` maps the mesh (FAT). No field
-states these conventions, but every object has ``projected_cuboid``, its box in the image.
-:func:`find_convention` keeps the :class:`PoseConvention` that projects the mesh's box onto this
-box. :func:`check_observation` later compares every object.
+states this, but every object has ``projected_cuboid``, its box in the image, on which the right
+:class:`PoseConvention` projects the mesh's box.
 
 To add a convention, add its value to a ``Literal`` below, and its meaning to
 :meth:`Observation.T_cam_obj`.
@@ -144,14 +143,10 @@ def _rotated_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, 
 MAX_ERROR_PX: Final = 5.0
 """Allowed reprojection error of the instances that fit (``_MIN_FITTING``), even on photos."""
 
-_MAX_SHARE: Final = 0.05
-"""Allowed reprojection error of an instance as a share of its cuboid's longer side."""
+_MAX_SHARE: Final = 0.05  # reprojection error as a share of the cuboid's longer side
+_MIN_FITTING: Final = 0.75  # share of the instances that must fit; the others may be damaged
+_MIN_RATIO: Final = 3.0  # factor by which the error of conventions with other poses is larger
 
-_MIN_FITTING: Final = 0.75
-"""Share of the instances that must fit; the others may be damaged."""
-
-_MIN_RATIO: Final = 3.0
-"""Factor by which the error of any convention with other poses must be larger."""
 
 _ROUNDING_PX: Final = 0.05  # error difference of equally good fits, due to rounding in files
 _SAME_POSE: Final = 0.05  # largest corner distance between equal poses, diameters
@@ -197,18 +192,23 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
         for convention in POSE_CONVENTIONS
     }
     ranked = sorted(errors, key=lambda convention: errors[convention])
-    least = errors[ranked[0]]
-    if not least <= MAX_ERROR_PX:
-        raise _undecidable(where, "no known convention fits", ranked[:6], errors)
-    best = next(c for c in POSE_CONVENTIONS if errors[c] <= least + _ROUNDING_PX)
-    rivals = [convention for convention in ranked if convention != best]
-    equal = tuple(rival for rival in rivals if _same_poses(observations, best, rival))
-    others = [rival for rival in rivals if rival not in equal]
-    rival_px = min((errors[rival] for rival in others), default=np.inf)
-    if rival_px < _MIN_RATIO * errors[best] + _ROUNDING_PX:
-        raise _undecidable(where, "two conventions fit equally well", [best, *others[:5]], errors)
-    undecided = tuple(rival for rival in equal if replace(rival, frame=best.frame) != best)
-    return NddsFinding(best, errors[best], rival_px, undecided, len(observations))
+    least, reason, listed = errors[ranked[0]], "no known convention fits", ranked[:6]
+    if least <= MAX_ERROR_PX:
+        best = next(c for c in POSE_CONVENTIONS if errors[c] <= least + _ROUNDING_PX)
+        rivals = [convention for convention in ranked if convention != best]
+        equal = tuple(rival for rival in rivals if _same_poses(observations, best, rival))
+        others = [rival for rival in rivals if rival not in equal]
+        rival_px = min((errors[rival] for rival in others), default=np.inf)
+        if rival_px >= _MIN_RATIO * errors[best] + _ROUNDING_PX:
+            undecided = tuple(rival for rival in equal if replace(rival, frame=best.frame) != best)
+            return NddsFinding(best, errors[best], rival_px, undecided, len(observations))
+        reason, listed = "two conventions fit equally well", [best, *others[:5]]
+    figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in listed)
+    raise UserError(
+        f"{where}: {reason}; reprojection error: {figures}",
+        f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other error",
+        "pass the data set's own meshes in the right unit, and check its K",
+    )
 
 
 def check_observation(observation: Observation, convention: PoseConvention) -> Transform:
@@ -239,7 +239,6 @@ def check_observation(observation: Observation, convention: PoseConvention) -> T
 
 
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
-    """Return whether two conventions' poses agree, up to ``_SAME_POSE``, on most instances."""
     distances = []
     for observation in observations:
         T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part
@@ -253,15 +252,3 @@ def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseC
 def _quantile(values: Sequence[float]) -> float:
     """Return the upper quartile of the values, which is robust to damaged items."""
     return float(np.quantile(values, _MIN_FITTING, method="higher"))
-
-
-def _undecidable(
-    where: str, reason: str, listed: Sequence[PoseConvention], errors: dict[PoseConvention, float]
-) -> UserError:
-    """Return the error for a data set whose annotations fit none or several conventions."""
-    figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in listed)
-    return UserError(
-        f"{where}: {reason}; reprojection error: {figures}",
-        f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other error",
-        "pass the data set's own meshes in the right unit, and check its K",
-    )

@@ -1,7 +1,6 @@
 """Check that NDDS and FAT annotations agree with their cuboids, images and settings.
 
-No mesh is needed. Data sets differ in their conventions: x, y, z, w or w, x, y, z; boxes as (row,
-column) or (column, row); OpenCV's or OpenGL's camera axes. The report notes the convention of most
+No mesh is needed. Data sets differ in their conventions. The report notes the convention of most
 objects; deviating objects are defects.
 """
 
@@ -133,7 +132,6 @@ def _check_camera(
 
 
 def _check_ids(node: Node, objects: Objects) -> set[int]:
-    """Report ids shared by two objects of an annotation; return the set of ``segmentation_id``."""
     for name in ("instance_id", "segmentation_id"):
         stated = [item.get(name) for _, item, _ in objects]
         ids = [value for value in stated if type(value) is int and value > 0]  # −1, 0: none

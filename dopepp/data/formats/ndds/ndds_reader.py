@@ -26,14 +26,9 @@ from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
 
-_FAT_SUFFIX: Final = "_16k"
-"""Suffix of class names in FAT, e.g. ``003_cracker_box_16k``."""
-
-_MAX_OBSERVATIONS: Final = 60
-"""Instances, evenly spread over the items, that determine the convention."""
-
-_MAX_COUNTED_ITEMS: Final = 1000
-"""Reading this many annotations takes about a second."""
+_FAT_SUFFIX: Final = "_16k"  # of class names in FAT, e.g. ``003_cracker_box_16k``
+_MAX_OBSERVATIONS: Final = 60  # instances, evenly spread, that determine the convention
+_MAX_COUNTED_ITEMS: Final = 1000  # takes about a second to read
 
 
 class NddsReader:
@@ -83,7 +78,6 @@ class NddsReader:
         _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
 
     def _find_convention(self, items: Sequence[Path]) -> NddsFinding:
-        """Determine the convention of the poses from evenly spread items."""
         visible: list[Observation] = []
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
@@ -107,7 +101,6 @@ class NddsReader:
         return conventions.find_convention(visible or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
-        """Return the part of a class name in the files (see the reader's ``parts``), or None."""
         label = self._classes.get(label, label)
         if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
             label = label[: -len(_FAT_SUFFIX)]
@@ -155,7 +148,6 @@ class NddsReader:
         return Sample(image, K, instances, depth, self.name, self._key(path))
 
     def _key(self, path: Path) -> str:
-        """Return an annotation's path relative to the data set's folder, without suffix."""
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
     def _is_out_of_view(self, observation: Observation) -> bool:
@@ -168,7 +160,6 @@ class NddsReader:
     def _instance(
         self, observation: Observation, shape: Shape, counts_truncation: bool
     ) -> Instance:
-        """Return an observation as an instance without a mask, checked by ``check_observation``."""
         T_cam_obj = conventions.check_observation(observation, self.finding.convention)
         part, fraction = observation.part, observation.item.visibility
         keypoints = project_keypoints(part.cuboid, T_cam_obj, observation.K)
@@ -211,7 +202,6 @@ class NddsReader:
 
 
 def _find_items(folder: Path) -> list[Path]:
-    """Return the annotation files with an image; log the number of others."""
     items, without_image = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
         counts = f"({len(without_image)} JSON files without an image)"

@@ -17,23 +17,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_file
+from dopepp.core.files import encode_image, write_file
 from dopepp.core.json import read_json
-from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import Box
 from dopepp.data.formats.ndds import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
 from dopepp.data.sample import Instance, Sample
-from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
 
-CM: Final = 100.0
-"""Centimetres per metre."""
+CM: Final = 100.0  # centimetres per metre
 
 UNREAL_AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """P of ``pose_transform``, from the readme of Falling Things."""
@@ -52,8 +49,7 @@ CONVENTIONS: Final = {
 CAMERA_FIELDS: Final = ("width", "height", "intrinsics")
 """Fields of ``camera_data`` that images of one camera share."""
 
-_FARTHEST_PX: Final = 1e6
-"""Largest projected coordinate: points near the camera's plane have huge projections."""
+_FARTHEST_PX: Final = 1e6  # points near the camera's plane have huge projections
 
 _DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
 """Suffixes of files that, like any subfolder, show that a folder holds other data."""
@@ -79,36 +75,35 @@ class NddsWriter:
         settings = _encode(object_settings(list(self._parts.values())))
         present = sorted(self._root.glob("[!._]*")) if self._root.is_dir() else []
         foreign = [entry for entry in present if entry.is_dir() or entry.suffix in _DATA_SUFFIXES]
-        if path.is_file():
-            if path.read_bytes() == settings:
-                return
-            problem = f"{path} of other parts"
-        elif foreign:
-            problem = f"{foreign[0].name} in {self._root}, which is not from an NDDS writer"
-        else:
+        if not path.is_file() and not foreign:
             write_file(path, settings)
-            return
-        allowed = "an empty folder, or a folder begun with the same parts"
-        raise UserError(problem, allowed, "pass another folder")
+        elif not path.is_file() or path.read_bytes() != settings:
+            problem = f"{path} of other parts"
+            if not path.is_file():
+                problem = f"{foreign[0].name} in {self._root}, which is not from an NDDS writer"
+            allowed = "an empty folder, or a folder begun with the same parts"
+            raise UserError(problem, allowed, "pass another folder")
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an item's images and then its annotation, which marks the item as complete."""
-        segmentation = segmentation_map(sample.instances, sample.image.shape[:2])
-        record = {
-            "conventions": CONVENTIONS,
-            "camera_data": camera_data(sample),
-            "objects": [
-                object_record(number, instance, self._parts[instance.label].cuboid, sample.K)
-                for number, instance in enumerate(sample.instances, 1)
-            ],
-        }
+        # Values 1, 2, … on the visible pixels of the instances.
+        kind = np.uint8 if len(sample.instances) <= np.iinfo(np.uint8).max else np.uint16
+        segmentation = np.zeros(sample.image.shape[:2], kind)
+        objects = []
+        for number, instance in enumerate(sample.instances, 1):
+            if instance.mask is not None:
+                segmentation[instance.mask] = number
+            cuboid = self._parts[instance.label].cuboid
+            objects.append(object_record(number, instance, cuboid, sample.K))
         images = {".png": sample.image, ".seg.png": segmentation}
         if sample.depth is not None:
             steps = np.nan_to_num(np.rint(sample.depth.astype(np.float64) / DEPTH_UNIT))
             steps[(steps < 0) | (steps > np.iinfo(np.uint16).max)] = 0
             images[".depth.png"] = steps.astype(np.uint16)
         for suffix, image in images.items():
-            write_file(self._path(index, suffix), encode_png(image))
+            write_file(self._path(index, suffix), encode_image(image))
+        camera = camera_data(sample)
+        record = {"conventions": CONVENTIONS, "camera_data": camera, "objects": objects}
         write_file(self._path(index, ".json"), _encode(record))
 
     def _path(self, index: int, suffix: str) -> Path:
@@ -178,14 +173,7 @@ def camera_data(sample: Sample) -> dict[str, Any]:
 def object_record(
     number: int, instance: Instance, cuboid_obj: Float[np.ndarray, "9 3"], K: CameraMatrix
 ) -> dict[str, Any]:
-    """Return an entry of an annotation's ``objects``.
-
-    Args:
-        number: Id of the instance, from 1, and its value in ``.seg.png``.
-        instance: The annotated object.
-        cuboid_obj: Cuboid corners and centroid of the part, object frame, metres.
-        K: Camera matrix in pixels.
-    """
+    """Return the entry in ``objects`` of instance ``number``, from 1, with the part's cuboid."""
     cuboid = transform(instance.T_cam_obj, cuboid_obj)
     rotation, location = instance.T_cam_obj[:3, :3], CM * instance.T_cam_obj[:3, 3]
     w, x, y, z = matrix_to_quaternion(rotation).tolist()
@@ -214,17 +202,6 @@ def object_record(
         "cuboid": (CM * cuboid[:CENTROID]).tolist(),
         "projected_cuboid": projected[:CENTROID].tolist(),
     }
-
-
-def segmentation_map(
-    instances: Sequence[Instance], shape: Shape
-) -> Integer[np.ndarray, "height width"]:
-    """Return a map with 1, 2, … on the visible pixels of the instances and 0 elsewhere."""
-    labels = np.zeros(shape, np.uint8 if len(instances) <= np.iinfo(np.uint8).max else np.uint16)
-    for number, instance in enumerate(instances, 1):
-        if instance.mask is not None:
-            labels[instance.mask] = number
-    return labels
 
 
 def _encode(record: dict[str, Any]) -> bytes:

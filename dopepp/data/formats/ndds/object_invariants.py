@@ -34,18 +34,14 @@ PROJECTION_PX: Final = 2.0
 PROJECTION_SHARE: Final = 0.02
 """Allowed error of a stated projection: pixels, plus a share of the cuboid's longer side."""
 
-ORIENTATION_RAD: Final = np.deg2rad(2.0)
-"""Allowed angle between two statements of an orientation."""
-
-MATRIX_TOLERANCE: Final = 5e-3
-NORM_TOLERANCE: Final = 0.01
-"""Allowed deviations of ``pose_transform`` from a rotation and of a quaternion's norm from 1."""
-
+ORIENTATION_RAD: Final = np.deg2rad(2.0)  # angle between two statements of an orientation
+MATRIX_TOLERANCE: Final = 5e-3  # deviation of ``pose_transform`` from a rotation
+NORM_TOLERANCE: Final = 0.01  # deviation of a quaternion's norm from 1
 EDGE_SHARE: Final = 0.02
 """Allowed inequality and slant of edges, as a share of the longest; a thinner box is flat."""
 
-SIZE_SHARE: Final = 0.05
-"""Allowed difference of edges from the class's ``cuboid_dimensions``."""
+SIZE_SHARE: Final = 0.05  # difference of edges from the class's ``cuboid_dimensions``
+
 
 _EDGES: Final = np.array(
     [
@@ -56,15 +52,8 @@ _EDGES: Final = np.array(
 )
 """Corner pairs of the edges along x, y and z, from the negative to the positive end."""
 
-_DOCUMENTED: Final = {
-    "quaternion_xyzw": "x, y, z, w",
-    "bounding_box": "row, column",
-    "camera axes": "OpenCV",
-}
-"""Conventions that NDDS documents."""
-
-_MAX_MINORITY: Final = 1000
-"""Largest number of stored objects per convention, for reports of minorities."""
+_DOCUMENTED: Final = ("x, y, z, w", "row, column", "OpenCV")  # conventions of NDDS
+_MAX_MINORITY: Final = 1000  # stored objects per convention, for reports of minorities
 
 
 class Majority:
@@ -86,7 +75,7 @@ class Majority:
         """Note each majority that NDDS does not document, and report the objects of minorities."""
         for subject, votes in self._votes.items():
             (common, number), *rest = votes.most_common()
-            if common != _DOCUMENTED[subject]:
+            if common not in _DOCUMENTED:
                 self._report.note(f"{subject}: {common} ({number:,} objects)")
             for convention, _ in rest:
                 for node in self._nodes[subject, convention]:
@@ -225,7 +214,6 @@ class ObjectCheck:
                     self._node[name].report(message)
 
     def _check_bounding_box(self, visible_box: Box | None) -> None:
-        """Report a ``bounding_box`` that is inverted or does not contain the visible pixels."""
         entry = mapping(self._item.get("bounding_box"))
         if not entry:
             return
@@ -278,7 +266,6 @@ class ObjectCheck:
         return False
 
     def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
-        """Report annotated projections that differ from those of ``cuboid`` (camera frame)."""
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
             return  # projections of an object partly behind the camera are meaningless
@@ -295,7 +282,6 @@ class ObjectCheck:
 
 
 def _finite(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
-    """Return an array, or None if a number is missing or not finite."""
     return values if values is not None and np.isfinite(values).all() else None
 
 

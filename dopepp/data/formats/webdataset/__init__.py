@@ -18,11 +18,14 @@ import numpy as np
 from jaxtyping import Int64
 
 from dopepp.core.errors import UserError
-from dopepp.data.archive import BoundedStream
 from dopepp.data.formats.problems import STRICT, Node, Problems
 
-FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
-"""Members of an image that the reader reads."""
+FIELDS: Final = {
+    "image": re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)"),
+    "depth": re.compile(r"depth\.(png|tiff?)"),
+    **{name: re.compile(rf"{name}\.json") for name in ("camera", "gt", "gt_info", "mask_visib")},
+}
+"""Extensions of the members that the reader reads, by field; image and camera are required."""
 
 MAX_MEMBER_BYTES: Final = 256_000_000
 MAX_MEMBERS: Final = 1_000_000
@@ -31,8 +34,7 @@ MAX_MEMBERS: Final = 1_000_000
 KEY_FILE: Final = "key_to_shard.json"
 """File in the folder of the shards that lists the shard of every key."""
 
-_IMAGE: Final = re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)")
-_DEPTH: Final = re.compile(r"depth\.(png|tiff?)")
+_MAX_READ_BYTES: Final = 1 << 20
 _ALLOWED: Final = (
     f"a complete uncompressed tar of plain files KEY.EXTENSION, each once and of at most "
     f"{MAX_MEMBER_BYTES / 1e6:.0f} MB, with rgb (or gray) and camera.json for every key"
@@ -62,7 +64,7 @@ class ShardIndex:
 
     def read(self, image: int, field: str) -> bytes | None:
         """Return the content of an image's ``field`` (in :data:`FIELDS`), or None if missing."""
-        offset, size = self.spans[image, FIELDS.index(field)].tolist()
+        offset, size = self.spans[image, [*FIELDS].index(field)].tolist()
         return None if offset < 0 else read_span(self.path, offset, size)
 
 
@@ -92,23 +94,20 @@ def index_shard(path: Path) -> ShardIndex:
             member is repeated.
     """
     node = Node(STRICT, path, "archive")
-    rows: dict[str, int] = {}
-    spans: dict[tuple[int, int], tuple[int, int]] = {}
+    spans: dict[str, dict[str, tuple[int, int]]] = {}  # by key and field
     for member in members(path):
         field = field_of(member.extension)
         if field is not None:
-            slot = rows.setdefault(member.key, len(rows)), FIELDS.index(field)
-            if slot in spans:
+            fields = spans.setdefault(member.key, {})
+            if field in fields:
                 node.report(f"{member.key} with two members for its {field}", _ALLOWED)
-            spans[slot] = member.offset, member.size
-    table = np.full((len(rows), len(FIELDS), 2), -1, np.int64)
-    if spans:
-        table[tuple(np.array(list(spans)).T)] = list(spans.values())
+            fields[field] = member.offset, member.size
     for name, noun in (("image", "rgb or gray"), ("camera", "camera")):
-        for key, row in rows.items():
-            if table[row, FIELDS.index(name), 0] < 0:
+        for key, fields in spans.items():
+            if name not in fields:
                 node.report(f"{key} without {noun}", _ALLOWED)
-    return ShardIndex(path, list(rows), table)
+    rows = [[fields.get(name, (-1, -1)) for name in FIELDS] for fields in spans.values()]
+    return ShardIndex(path, list(spans), np.array(rows, np.int64).reshape(-1, len(FIELDS), 2))
 
 
 def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
@@ -123,13 +122,12 @@ def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
     """
     node = Node(problems, path, "archive")
     try:
-        with path.open("rb") as file:
+        with _ShardFile(path) as file:
             if file.read(2) == b"\x1f\x8b":
                 node.report("a compressed archive", _ALLOWED)
                 return
-            size = file.seek(0, io.SEEK_END)
             file.seek(0)
-            yield from _walk(node, file, size)
+            yield from _walk(node, file, path.stat().st_size)
     except UserError:
         raise
     except OSError as error:
@@ -138,10 +136,19 @@ def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
         node.report(f"damaged: {error}", _ALLOWED)
 
 
-def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
+class _ShardFile(io.FileIO):
+    """A file that rejects large reads: a tar header can claim a name of any length."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or not 0 <= size <= _MAX_READ_BYTES:
+            raise ValueError(f"a header of {size} bytes")
+        return super().read(size)
+
+
+def _walk(node: Node, file: _ShardFile, size: int) -> Iterator[TarMember]:
     """Yield the members of a shard; report members that are repeated, unsafe or too large."""
     names: set[str] = set()
-    with tarfile.open(fileobj=BoundedStream(file), mode="r:") as archive:
+    with tarfile.open(fileobj=file, mode="r:") as archive:
         while (info := archive.next()) is not None:
             archive.members = []  # type: ignore[attr-defined]  # which collects all headers
             name = PurePosixPath(info.name)
@@ -155,10 +162,9 @@ def _walk(node: Node, file: io.BufferedReader, size: int) -> Iterator[TarMember]
                 node.report(f"member {info.name!r:.80} {problem}", _ALLOWED)
                 continue
             names.add(info.name)
-            key, _, extension = name.name.partition(".")
-            yield TarMember(
-                str(name.with_name(key)), extension.lower(), info.offset_data, info.size
-            )
+            stem, _, extension = name.name.partition(".")
+            key = str(name.with_name(stem))
+            yield TarMember(key, extension.lower(), info.offset_data, info.size)
         end = archive.offset
     # tarfile stops without an error at a damaged header and at the end of a truncated file.
     file.seek(end)
@@ -174,7 +180,6 @@ def _leads_out(info: tarfile.TarInfo) -> bool:
 
 
 def _problem(info: tarfile.TarInfo, archive_size: int) -> str:
-    """Return why a member of an archive (size in bytes) is rejected, or an empty string."""
     key, dot, _ = PurePosixPath(info.name).name.partition(".")
     if _leads_out(info):
         return "which leads out of the archive"
@@ -189,9 +194,4 @@ def _problem(info: tarfile.TarInfo, archive_size: int) -> str:
 
 def field_of(extension: str) -> str | None:
     """Return the entry of :data:`FIELDS` for a member's extension, or None."""
-    if _IMAGE.fullmatch(extension):
-        return "image"
-    if _DEPTH.fullmatch(extension):
-        return "depth"
-    field, _, suffix = extension.partition(".")
-    return field if field in FIELDS and suffix == "json" else None
+    return next((name for name, pattern in FIELDS.items() if pattern.fullmatch(extension)), None)

@@ -23,8 +23,7 @@ from dopepp.drawing.pictures import Mask, Shape
 _MAX_IMAGE_BYTES: Final = 2 * shards.MAX_MEMBER_BYTES
 """Limit of the sum of the sizes of an image's members."""
 
-Content = dict[str, bytes]
-"""An image's members by extension."""
+Content = dict[str, bytes]  # an image's members by extension
 
 
 def shard_paths(root: Path) -> Iterator[Path]:

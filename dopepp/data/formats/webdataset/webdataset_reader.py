@@ -1,21 +1,17 @@
-"""Read BOP-WebDataset: tar shards with random access, so a run resumes exactly.
-
-Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.json``,
-``KEY.gt.json``, ``KEY.gt_info.json`` and ``KEY.mask_visib.json``; lengths are in millimetres.
-"""
+"""Read BOP-WebDataset: tar shards with random access, so a run resumes exactly."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property, partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 import numpy as np
 
@@ -35,11 +31,8 @@ from dopepp.parts.part import Part
 _log = logging.getLogger(__name__)
 
 MAX_SHARDS: Final = 100_000
-MAX_SHARD_BYTES: Final = 20_000_000_000
-"""Largest shard to download; BOP's have about 1 GB."""
-
-_MAX_TEXT: Final = 4000
-"""Characters of a path; Python parses no number with more digits."""
+MAX_SHARD_BYTES: Final = 20_000_000_000  # largest shard to download; BOP's have about 1 GB
+_MAX_TEXT: Final = 4000  # characters of a name
 
 _MAX_BRACES: Final = 10
 _PIECE_BYTES: Final = 1 << 20
@@ -52,9 +45,9 @@ class WebdatasetReader:
     """Reader of the images of shards, in the order of the shards.
 
     The constructor reads headers; members are read and checked with their image. An image
-    without ``gt.json`` has no instances. The reader ignores objects that are not among the parts
-    or lie behind the camera. The visible fraction is ``visib_fract`` of ``gt_info.json``, or
-    an estimate of :func:`~dopepp.data.formats.make_instance`.
+    without ``gt.json`` has no instances. Objects that are not among the parts or lie behind the
+    camera are ignored. The visible fraction is ``visib_fract`` of ``gt_info.json``, or an estimate
+    of :func:`~dopepp.data.formats.make_instance`.
 
     Args:
         parts: Objects to return, named as in ``models_info.json`` or ``obj_000001``.
@@ -131,7 +124,7 @@ class WebdatasetReader:
         for shard, row in self._items:
             digest.update(shard.keys[row].encode())
             digest.update(shard.spans[row, :, 1].tobytes())
-            has_infos &= bool(shard.spans[row, FIELDS.index("gt_info"), 0] >= 0)
+            has_infos &= bool(shard.spans[row, [*FIELDS].index("gt_info"), 0] >= 0)
         identity: dict[str, object] = {
             "shards": [shard.path.name for shard in self._shards],
             "members": digest.hexdigest(),
@@ -202,7 +195,6 @@ def _records(shard: ShardIndex, image: int) -> ShardRecords:
 
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:
-    """Raise a UserError if two shards contain the same key."""
     shard_of: dict[str, Path] = {}
     for shard in shards:
         if repeated := [key for key in shard.keys if key in shard_of]:
@@ -230,39 +222,34 @@ def find_shards(root: Path, shards: str, download_dir: Path | None = None) -> li
         scheme = _SCHEME.match(text)
         if scheme is None:
             paths += _local_shards(root / text)
-        elif scheme[1].lower() == "file":
-            paths += _local_shards(Path(url2pathname(urlsplit(text).path)))
         else:
             paths.append(_fetch_shard(text, scheme[1].lower(), download_dir))
     if len(set(paths)) < len(paths):
-        twice = next(path for path in paths if paths.count(path) > 1)
+        twice, _ = Counter(paths).most_common(1)[0]
         fix = "name every shard once in data.image_sets"
         raise UserError(f"shard {twice} twice", "each shard once", fix)
     return paths
 
 
 def _expand_braces(text: str) -> list[str]:
-    """Expand the braces in a name of shards to at most MAX_SHARDS names."""
     from braceexpand import braceexpand  # comes with the webdataset library
 
     # The library builds a whole range at once and does not limit the product of braces.
     lengths = [abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text[:_MAX_TEXT])]
-    is_short = len(text) <= _MAX_TEXT and text.count("{") <= _MAX_BRACES
-    try:
-        if is_short and max(lengths, default=0) < MAX_SHARDS:
-            expanded = list(islice(braceexpand(text), MAX_SHARDS + 1))
-            if len(expanded) <= MAX_SHARDS:
-                return expanded
-    except ValueError as error:
-        problem, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
-        raise UserError(problem, allowed, "write the braces in this form") from error
-    allowed = f"at most {MAX_SHARDS:,} shards"
+    if max(len(text) - _MAX_TEXT, text.count("{") - _MAX_BRACES) <= 0:
+        try:
+            if max(lengths, default=0) < MAX_SHARDS:
+                expanded = list(islice(braceexpand(text), MAX_SHARDS + 1))
+                if len(expanded) <= MAX_SHARDS:
+                    return expanded
+        except ValueError as error:
+            problem, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
+            raise UserError(problem, allowed, "write the braces in this form") from error
     fix = "shorten the range of numbers, or name a folder of shards"
-    raise UserError(f"shards {text!r:.100}", allowed, fix)
+    raise UserError(f"shards {text!r:.100}", f"at most {MAX_SHARDS:,} shards", fix)
 
 
 def _local_shards(path: Path) -> list[Path]:
-    """Return the shard at a path, or all shards in a folder."""
     if path.is_file():
         return [path]
     shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))
@@ -275,46 +262,37 @@ def _local_shards(path: Path) -> list[Path]:
 
 
 def _fetch_shard(url: str, scheme: str, folder: Path | None) -> Path:
-    """Download a shard unless the folder contains it; return its path."""
-    problem = f"shards {url!r:.100}"
-    if scheme == "pipe":  # an untrusted config must not run commands
-        allowed = "files, folders and URLs of shards"
-        fix = "download the shards and pass their folder"
-        raise UserError(f"{problem}, a command to run", allowed, fix)
+    """Return the path of a shard in a folder, where the webdataset library downloads it once."""
     if folder is None:
-        problem, allowed = f"{problem}, which are not on this machine", "local shards, or a folder"
-        fix = "set data.download_dir=FOLDER"
-        raise UserError(problem, f"{allowed} to download them into", fix)
+        problem = f"shards {url!r:.100}, which are not on this machine"
+        allowed = "local shards, or a folder to download them into"
+        raise UserError(problem, allowed, "set data.download_dir=FOLDER")
     name = PurePosixPath(urlsplit(url).path).name
     if not name.endswith(".tar"):
         name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"
     path = folder / name
-    if not path.exists():
-        _log.info("downloading %s to %s", url, path)
-        _download(url, scheme, path)
-    return path
-
-
-def _download(url: str, scheme: str, path: Path) -> None:
-    """Download a shard of at most ``MAX_SHARD_BYTES`` with the webdataset library."""
+    if path.exists():
+        return path
     from webdataset.gopen import gopen, gopen_schemes  # imports torch where it is installed
 
-    if scheme not in gopen_schemes:
-        schemes = ", ".join(sorted(gopen_schemes.keys() - {"__default__", "pipe"}))
+    # "pipe" is a command to run, which an untrusted config must not do.
+    schemes = sorted(gopen_schemes.keys() - {"__default__", "pipe"})
+    if scheme not in schemes:
         fix = "download the shards and pass their folder"
-        raise UserError(f"shards {url!r:.100}", f"URLs of {schemes}", fix)
+        raise UserError(f"shards {url!r:.100}", f"URLs of {', '.join(schemes)}", fix)
+    _log.info("downloading %s to %s", url, path)
     size = 0
     try:
         with draft(path) as partial, gopen(url) as stream, partial.open("wb") as file:
             while piece := stream.read(_PIECE_BYTES):
-                size += len(piece)
+                size += file.write(piece)
                 if size > MAX_SHARD_BYTES:
                     allowed = f"shards of at most {MAX_SHARD_BYTES / 1e9:.0f} GB"
                     problem = f"{url} of over {size / 1e9:.0f} GB"
                     raise UserError(problem, allowed, "divide this shard into smaller ones")
-                file.write(piece)
     except OSError as error:
         problem = f"shard {url}, which cannot be downloaded to {path.parent}: {error!s:.200}"
         allowed = "a readable URL and enough disk space"
         fix = "open the URL in a browser to test it, and free space"
         raise UserError(problem, allowed, fix) from error
+    return path

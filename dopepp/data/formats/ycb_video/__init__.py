@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_limited
 from dopepp.data.formats.images import header_shape, read_map
 from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Node, Problems
@@ -31,15 +33,11 @@ def read_classes(root: Path) -> list[str]:
         UserError: The folder is not one of YCB-Video.
     """
     path = root / "image_sets" / "classes.txt"
-    for is_present, problem in (
-        (root.is_dir(), "is not a folder"),
-        ((root / "data").is_dir(), "has no data/"),
-        (path.is_file(), "has no image_sets/classes.txt"),
-    ):
-        if not is_present:
-            allowed = "a YCB-Video folder with data/, image_sets/classes.txt and models/"
-            fix = "set data.root to the unpacked YCB-Video data set"
-            raise UserError(f"data.root={root}, which {problem}", allowed, fix)
+    if not (path.is_file() and (root / "data").is_dir()):
+        lacking = "image_sets/classes.txt" if (root / "data").is_dir() else "data/"
+        allowed = "a YCB-Video folder with data/, image_sets/classes.txt and models/"
+        fix = "set data.root to the unpacked YCB-Video data set"
+        raise UserError(f"data.root={root}, which has no {lacking}", allowed, fix)
     return path.read_text().split()
 
 
@@ -103,11 +101,13 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     for name in ("cls_indexes", "poses", "factor_depth"):
         if name not in fields:
             node[name].report("missing", _ALLOWED)
-    factor_depth = np.nan
+    factor_depth, K = np.nan, None
     if "factor_depth" in fields:
         factor_depth = node["factor_depth"].scalar(fields["factor_depth"])
     if factor_depth <= 0:
         node["factor_depth"].report(f"{factor_depth:g}", "above 0")
+    if "intrinsic_matrix" in fields:
+        K = node["intrinsic_matrix"].numbers(fields["intrinsic_matrix"], 3, 3)
     poses: dict[int, Transform] = {}
     columns: dict[int, int] = {}
     for column, (index, pose) in enumerate(_columns(node, fields)):
@@ -116,27 +116,21 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
             continue
         poses[index] = _pose(pose, node["poses"][column])
         columns[index] = column
-    K = fields.get("intrinsic_matrix")
-    K = None if K is None else node["intrinsic_matrix"].numbers(K, 3, 3)
     return FrameMeta(poses, columns, K, factor_depth)
 
 
 def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
     """Read the ``_FIELDS`` of a ``meta.mat``; report an unreadable file and return None."""
     try:
-        size = path.stat().st_size
-        content = path.read_bytes() if size <= _MAX_META_BYTES else None
-    except OSError as error:
-        node.report(str(error.strerror), _ALLOWED)
-        return None
-    if content is None:
-        node.report(f"{size:,} bytes", f"at most {_MAX_META_BYTES:,}")
+        content = read_limited(path, _MAX_META_BYTES)
+    except (OSError, ValueError) as error:
+        node.report(str(getattr(error, "strerror", None) or error), _ALLOWED)
         return None
     if not _is_complete(content):
-        node.report(f"cut short after {size} bytes", _ALLOWED)
+        node.report(f"cut short after {len(content)} bytes", _ALLOWED)
     try:
         # The other fields, e.g. vertmap, are large and not needed.
-        return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
+        return dict(scipy.io.loadmat(io.BytesIO(content), variable_names=_FIELDS))
     except Exception as error:  # damage makes SciPy raise any type
         node.report(f"damaged ({error})", _ALLOWED)
         return None

@@ -5,11 +5,9 @@ An object without a label pixel is not a defect: some releases label only some o
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -17,12 +15,11 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats import ycb_video
 from dopepp.data.formats.invariants import Box, check_box, check_translation, plausible_camera
 from dopepp.data.formats.problems import CheckReport, Node
-from dopepp.data.formats.ycb_video import FrameMeta, Subset
+from dopepp.data.formats.ycb_video import Subset
 from dopepp.drawing.pictures import Shape
-from dopepp.geometry.camera import CameraMatrix, transform
+from dopepp.geometry.camera import transform
 from dopepp.parts.mesh import Points, largest_distance
-
-_MAX_POINTS: Final = 100_000
+from dopepp.parts.mesh.read import read_points
 
 
 def check_ycb(report: CheckReport) -> None:
@@ -81,16 +78,8 @@ class _FrameCheck:
         if not path.is_file():
             self._report.note(f"models/{name}/points.xyz is missing: its boxes are not checked")
             return None
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                points = np.loadtxt(path, max_rows=_MAX_POINTS, ndmin=2)
-            if points.shape[1] != 3 or not np.isfinite(points).all():
-                raise ValueError(f"shape {points.shape}, or not finite")
-        except (ValueError, UserWarning) as error:
-            self._report.report(path, "points", f"{error}", "three finite numbers per line")
-            return None
-        return points, largest_distance(points)
+        points = Node(self._report, path, "points").attempt(lambda: read_points(path))
+        return None if points is None else (points, largest_distance(points))
 
     def check(self, start: str, subset: Subset) -> None:
         """Check the files of the frame whose paths start with ``start``."""
@@ -105,31 +94,19 @@ class _FrameCheck:
             if without_pose:
                 message = f"classes {without_pose} without a pose in meta.mat"
                 self._report.report(Path(f"{start}-label.png"), "values", message)
-        for index in meta.poses:
-            visible_box = None if label is None else Box.of_mask(label == index)
-            self._check_pose(node, meta, index, K, visible_box)
-
-    def _check_pose(
-        self,
-        node: Node,
-        meta: FrameMeta,
-        index: int,
-        K: CameraMatrix | None,
-        visible_box: Box | None,
-    ) -> None:
-        """Check position and visible box of class ``index`` in ``meta``; ``node`` is its file."""
-        column, T_cam_obj = meta.columns[index], meta.poses[index]
-        if not 1 <= index <= len(self._classes):
-            allowed = f"1 … {len(self._classes)}, the lines of classes.txt"
-            node["cls_indexes"][column].report(f"unknown class {index}", allowed)
-            return
-        node = node["poses"][column]
-        size = self._size(self._classes[index - 1])
-        points, diameter = (None, None) if size is None else size
-        is_posed = check_translation(node, T_cam_obj[:3, 3], diameter)
-        is_posed &= bool(np.isfinite(T_cam_obj).all())
-        if is_posed and points is not None and K is not None:
-            check_box(node["box"], transform(T_cam_obj, points), K, visible_box)
+        for index, T_cam_obj in meta.poses.items():
+            column = meta.columns[index]
+            if not 1 <= index <= len(self._classes):
+                allowed = f"1 … {len(self._classes)}, the lines of classes.txt"
+                node["cls_indexes"][column].report(f"unknown class {index}", allowed)
+                continue
+            pose_node = node["poses"][column]
+            points, diameter = self._size(self._classes[index - 1]) or (None, None)
+            is_posed = check_translation(pose_node, T_cam_obj[:3, 3], diameter)
+            is_posed &= bool(np.isfinite(T_cam_obj).all())
+            if is_posed and points is not None and K is not None:
+                visible_box = None if label is None else Box.of_mask(label == index)
+                check_box(pose_node["box"], transform(T_cam_obj, points), K, visible_box)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
         """Check ``box.txt``, if present, with lines of name, left, top, right and bottom."""

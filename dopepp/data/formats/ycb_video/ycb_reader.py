@@ -25,8 +25,7 @@ from dopepp.virtual.backgrounds import Backgrounds
 
 _log = logging.getLogger(__name__)
 
-_MAX_COUNTED_FRAMES: Final = 1000
-"""Reading this many meta.mat files takes about a second."""
+_MAX_COUNTED_FRAMES: Final = 1000  # reading this many meta.mat files takes about a second
 
 _FIRST_SCENE_OF_SECOND_CAMERA: Final = 60
 _CAMERAS: Final = (
@@ -47,10 +46,10 @@ class YcbVideoReader:
 
     Args:
         parts: Objects to return, named as in ``classes.txt``.
-        image_set: Name of the list in ``image_sets/``; exclusive with ``frames``.
+        image_set: Name of the list in ``image_sets/``, or its frames: ``0050/000003`` (real) or
+            ``000000`` (synthetic).
         subset: ``real`` reads ``data/``, ``synthetic`` reads ``data_syn/``.
-        frames: Frames instead of a list: ``0050/000003`` (real) or ``000000`` (synthetic).
-        backgrounds: Images for the transparent background of synthetic frames.
+        backgrounds: Images for the transparent background of synthetic frames, which need them.
         seed: Seed of the backgrounds, which change with the epoch.
 
     Raises:
@@ -61,17 +60,12 @@ class YcbVideoReader:
         self,
         root: Path,
         parts: Sequence[Part],
-        image_set: str | None = None,
+        image_set: str | Sequence[str],
         subset: Subset = "real",
-        frames: Sequence[str] | None = None,
         backgrounds: Backgrounds | None = None,
         seed: int = 0,
         read_depth: bool = True,
     ) -> None:
-        if (image_set is None) == (frames is None):
-            raise ValueError("give either image_set or frames")
-        if subset == "synthetic" and backgrounds is None:
-            raise ValueError("synthetic frames are transparent: give backgrounds")
         self.root, self.subset = Path(root), subset
         self.name = f"ycb_video/{ycb_video.FOLDERS[subset]}"
         classes = ycb_video.read_classes(self.root)
@@ -81,25 +75,20 @@ class YcbVideoReader:
             fix = "set data.objects to one or more of these names"
             raise UserError(f"objects {unknown}", allowed, fix)
         self._parts = {classes.index(part.name) + 1: part for part in parts}
-        if image_set is not None:
-            frames = ycb_video.read_image_set(self.root, image_set, subset)
-        list_name = f"{image_set}.txt" if image_set else "frames"
-        self.frames = self._present_frames(list(frames or ()), list_name)
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
-
-    def _present_frames(self, listed: list[str], list_name: str) -> list[str]:
-        folder = self.root / ycb_video.FOLDERS[self.subset]
-        is_present = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
-        absent = [frame for frame in listed if not is_present[frame]]
-        if len(absent) == len(listed):
-            problem = f"no frame of {list_name} under {folder} ({len(absent):,} listed)"
+        list_name, listed = "frames", image_set
+        if isinstance(image_set, str):
+            list_name = f"{image_set}.txt"
+            listed = ycb_video.read_image_set(self.root, image_set, subset)
+        self.frames = [f for f in listed if Path(f"{self._start(f)}-color.png").is_file()]
+        num_absent = len(listed) - len(self.frames)
+        if not self.frames:
+            problem = f"no frame of {list_name} under {self._start('')} ({num_absent:,} listed)"
             fix = "unpack all archives of the data set into it, or set another image set"
             raise UserError(problem, "at least one listed frame on disk", fix)
-        if absent:
-            counts = f"{len(absent):,} of {len(listed):,}"
-            message = "%s: %s frames listed in %s are absent; first: %s"
-            _log.warning(message, self.name, counts, list_name, absent[0])
-        return [frame for frame in listed if is_present[frame]]
+        if num_absent:
+            counts = f"{num_absent:,} of {len(listed):,}"
+            _log.warning("%s: %s frames listed in %s are absent", self.name, counts, list_name)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -122,7 +111,8 @@ class YcbVideoReader:
                 mask = None if is_real and not labelled.any() else labelled
                 pose = meta.poses[class_index]
                 instances.append(make_instance(part, pose, K, np.nan, mask, shape))
-        return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
+        image = frame.image if is_real else self._composite(frame.image, name, epoch)
+        return Sample(image, K, instances, depth, self.name, name)
 
     def _start(self, frame: str) -> str:
         """Return the common start of the paths of a frame's files, ``ROOT/data/0050/000003``."""
@@ -131,10 +121,9 @@ class YcbVideoReader:
     def _meta(self, frame: str) -> FrameMeta:
         return ycb_video.read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
-    def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> RGBImage:
-        """Return RGB: a synthetic frame is composited on the background of (seed, epoch, frame)."""
-        if self.subset == "real" or self._backgrounds is None:
-            return image
+    def _composite(self, image: NDArray[Any], frame: str, epoch: int) -> RGBImage:
+        """Return a synthetic frame on the background of (seed, epoch, frame)."""
+        assert self._backgrounds is not None
         rng = item_rng(self._seed, Purpose.BACKGROUND, epoch, int(frame))
         background = self._backgrounds.draw(rng, image.shape[1], image.shape[0])
         alpha = image[..., 3:].astype(np.float32) / 255

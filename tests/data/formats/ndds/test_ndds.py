@@ -242,8 +242,6 @@ SLANTED = make_transform(
     Rotation.from_euler("xyz", [80, 23, -12], degrees=True).as_matrix(),
     np.array([0.013, -0.04, 0.02]),
 )
-SLANTED[:3, :3] = Rotation.from_euler("xyz", [80, 23, -12], degrees=True).as_matrix()
-SLANTED[:3, 3] = [0.013, -0.04, 0.02]
 
 
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])

@@ -24,10 +24,10 @@ def ycb_part_of(root: Path, name: str) -> Part:
 
 
 def source_of(tree: Any, box: Part, **options: Any) -> YcbVideoReader:
-    return YcbVideoReader(tree.root, [box], **({"frames": ["0000/000001"]} | options))
+    return YcbVideoReader(tree.root, [box], **({"image_set": ["0000/000001"]} | options))
 
 
-SYNTHETIC = {"frames": ["000000"], "subset": "synthetic", "backgrounds": ProceduralBackgrounds()}
+SYNTHETIC = {"image_set": ["000000"], "subset": "synthetic", "backgrounds": ProceduralBackgrounds()}
 
 
 def test_reads_pose_camera_depth_and_mask(ycb_tree, box):
@@ -56,7 +56,7 @@ def test_the_scene_determines_a_missing_camera(ycb_tree, box, scene, fx):
     image = np.zeros((480, 640, 3), np.uint8)
     for what, array in (("color", image), ("label", image[..., 0]), ("depth", image[..., 0])):
         cv2.imwrite(str(ycb_tree.path(frame, f"{what}.png")), array)
-    assert source_of(ycb_tree, box, frames=[frame]).sample(0).K[0, 0] == fx
+    assert source_of(ycb_tree, box, image_set=[frame]).sample(0).K[0, 0] == fx
 
 
 def test_visible_fraction_of_a_half_hidden_object(ycb_tree, box):
@@ -104,12 +104,12 @@ def test_describe_and_contains(ycb_tree, box):
     for frame, number in (("0000/000001", 2), ("0000/000002", 1)):
         ycb_tree.write(frame, classes=(number,))
     parts, frames = [box, replace(box, name="004_mug")], ["0000/000002", "0000/000001"]
-    source = YcbVideoReader(ycb_tree.root, parts, frames=frames)
+    source = YcbVideoReader(ycb_tree.root, parts, frames)
     contained = [source.contains(name) for name in ("003_box", "004_mug", "no_such")]
     assert contained == [True, False, False]
     (info,) = source.describe()
     assert (info.num_images, info.num_instances) == (2, {"003_box": 1, "004_mug": 0})
-    (other,) = YcbVideoReader(ycb_tree.root, parts, frames=frames[1:]).describe()
+    (other,) = YcbVideoReader(ycb_tree.root, parts, frames[1:]).describe()
     assert info.identity != other.identity
 
 
@@ -125,7 +125,7 @@ def test_hull_areas_against_trimesh_and_shapes():
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ({"root": "nowhere"}, r"which is not a folder.*set data\.root"),
+    ({"root": "nowhere"}, r"nowhere, which has no data/.*set data\.root"),
     ({"root": "empty"}, r"empty, which has no data/.*a YCB-Video folder"),
     ({"root": "bare"}, r"no image_sets/classes\.txt"),
     ({"part": "servoholder"}, r"'servoholder'.*002_can.*003_box.*004_mug"),
@@ -145,13 +145,6 @@ def test_wrong_roots_and_unknown_names_are_rejected(arguments, message, tmp_path
         YcbVideoReader(tmp_path / given["root"], [part], given["image_set"])
 
 
-def test_wrong_arguments_are_rejected(ycb_tree, box):
-    with pytest.raises(ValueError, match="either image_set or frames"):
-        YcbVideoReader(ycb_tree.root, [box])
-    with pytest.raises(ValueError, match="give backgrounds"):
-        YcbVideoReader(ycb_tree.root, [box], "train", "synthetic")
-
-
 @pytest.mark.parametrize(
     ("frame", "name"),
     [
@@ -163,7 +156,7 @@ def test_wrong_arguments_are_rejected(ycb_tree, box):
 )
 def test_projected_cuboid_covers_the_real_label_at_its_depth(ycb_root, frame, name):
     part = ycb_part_of(ycb_root, name)
-    sample = YcbVideoReader(ycb_root, [part], frames=[frame]).sample(0)
+    sample = YcbVideoReader(ycb_root, [part], [frame]).sample(0)
     (instance,) = sample.instances
     hull = cv2.convexHull(instance.keypoints[:8].astype(np.float32))
     rows, columns = np.nonzero(instance.mask)
@@ -183,7 +176,7 @@ def test_real_synthetic_frame_and_lists(ycb_root, caplog):
     assert YcbVideoReader(ycb_root, parts, "train").frames == ["0000/000001", "0050/000003"]
     with caplog.at_level(logging.WARNING):
         test = YcbVideoReader(ycb_root, parts, "keyframe")
-    assert "2,949 frames listed in keyframe.txt are absent; first: 0048/000001" in caplog.text
+    assert "2,949 frames listed in keyframe.txt are absent" in caplog.text
     assert 1 <= len(test) <= 3
     backgrounds = ProceduralBackgrounds()
     synthetic = YcbVideoReader(ycb_root, parts, "train", "synthetic", backgrounds=backgrounds)
