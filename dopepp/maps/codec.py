@@ -123,8 +123,8 @@ class Peaks:
         covariance_px: Covariance of the position, pixels²: the excess variance of the peak over a
             target peak, plus the variance of the fit. A network trained with a proper loss returns
             the target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Weighted mean (x, y) of the unit vectors of the field around a corner's peak; the
-            more they differ, the shorter it is. Zero for a centroid.
+        toward: Weighted mean (x, y) of the field's unit vectors around a corner's peak. The more
+            the vectors differ, the shorter is the mean. Zero for a centroid.
     """
 
     position: Float[np.ndarray, "batch channels peaks 2"]
@@ -143,15 +143,16 @@ def find_peaks(
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
     A peak is a cell not below its eight neighbours. Among equal cells, as on a top that is clamped
-    to 1, the peak is the cell with the highest sum of 5×5 cells (usually the middle cell), or else
-    the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
+    to 1, the peak is the cell with the highest sum of the 5×5 cells around it (usually the central
+    cell of the top), or else the first cell in raster order. A Gaussian fit to the neighbourhood
+    gives the position.
 
     Args:
         belief: Belief maps, nine channels per object.
         geometry: Stride, peak width and disc radius.
         threshold: Belief that a peak exceeds.
         max_peaks: Number of slots per channel.
-        field: Vector fields, 16 channels per object; without them, ``toward`` is zero.
+        field: Vector fields, 16 channels per object (default: none, and ``toward`` is zero).
     """
     maps = _on_host(belief)
     height, width = maps.shape[2:]
@@ -213,7 +214,17 @@ def _find(
 
 @compiled()
 def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> int:
-    """Write belief, column, row of maxima above ``threshold``, highest first; return the count."""
+    """Write the highest local maxima above ``threshold``, by descending belief.
+
+    Args:
+        belief: Belief map of a channel, (height, width).
+        threshold: Belief that a maximum exceeds.
+        score: Filled with the beliefs of the maxima, (peaks,).
+        cells: Filled with (column, row) of the maxima, (peaks, 2).
+
+    Returns:
+        The number of maxima, at most the length of ``score``.
+    """
     count = 0
     for y in range(belief.shape[0]):
         for x in range(belief.shape[1]):
