@@ -307,7 +307,11 @@ class PoseEstimator:
         return merge_scales(scales)
 
     def _searched_depths(self, view: NetworkView) -> list[tuple[float, float] | None] | None:
-        """Return the depths in which poses of each part are searched; None without verification."""
+        """Return the depths at which :func:`recover` searches each part, metres.
+
+        A part has None if its training distances are unknown. Without verification, which chooses
+        between the poses, nothing is searched, and the result is None.
+        """
         if self.refiner is None or not self.refiner.verifies:
             return None
         seen = self.checkpoint.seen
@@ -360,11 +364,18 @@ class PoseEstimator:
     ) -> list[Detection]:
         """Refine detections; without a refinement, return the detections unchanged.
 
+        If a refined pose is improbable, the detection's ``alternative`` is refined too, and
+        replaces the pose if it is probable. After the time limit ``max_ms``, the remaining poses
+        are verified, but not refined.
+
         Args:
-            detections: Detections of these parts, from any source.
+            detections: Detections of the estimator's parts, in the order of refinement.
             image: RGB, without distortion.
             K: Camera matrix, pixels.
             depth: Metres along z, aligned to the image, 0 or NaN where unknown.
+
+        Returns:
+            The refined detections in the same order, with scores from before the refinement.
         """
         if self.refiner is None:
             return list(detections)
@@ -467,7 +478,7 @@ class PoseEstimator:
     def _missing(
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
     ) -> list[Reason]:
-        """Return a reason for each part or candidate without a detection before refinement."""
+        """Return a reason for each part without a candidate, and each rejected start detection."""
         stride, options = self.network.stride, self._recovery_options(self.min_score)
         reasons: list[Reason] = []
         for view in self.views(image, K, distances, roi):

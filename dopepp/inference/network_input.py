@@ -49,12 +49,12 @@ Depth32 = Float32[np.ndarray, "height width"]  # metres along z of every pixel
 Coefficients = Float[np.ndarray, "coefficients"]  # lens distortion, in OpenCV's order
 
 FARTHEST: Final = 50.0
-"""Median depth above which a depth image is rejected, metres: its values must be millimetres."""
+"""Median above which a depth image is rejected, metres: its values are probably millimetres."""
 
 METRES: Final = Span(0.001, 1000.0, "metres")  # valid distances
 
 MAX_PIXELS: Final = 640 * 480  # largest resized image; limits the smallest detectable part
-MARGIN: Final = 1.1  # ratio of sizes that hardly affects a network
+MARGIN: Final = 1.1  # ratio of two sizes of a part that hardly changes a network's detections
 
 
 def prepare_image(
@@ -199,7 +199,12 @@ class NetworkView:
         )
 
     def depths(self, seen: LearnedRange, diameter: float) -> tuple[float, float]:
-        """Return the depths (metres) at which a part has a size in this input as in training."""
+        """Return the nearest and farthest depth at which a part is as large as in training, metres.
+
+        Args:
+            seen: Sizes of the part in training.
+            diameter: Diameter of the part, metres.
+        """
         reach = diameter * focal_length(self.K)
         return reach / (MARGIN * seen.largest_px), MARGIN * reach / seen.smallest_px
 
@@ -269,9 +274,16 @@ def letterboxes(
 ) -> list[Letterbox]:
     """Return the sizes of an image on which the network runs, the smallest first.
 
-    By default, one group of sizes shows parts at the training distances. A further size is that of
-    training images, for parts that fill the image. Both are equal for the training camera. For a
-    checkpoint that records no training distances, only the size of training images is used.
+    One group of sizes shows parts at the expected distances as large as in training. By default,
+    the size of training images is added, for parts that fill the image. For the training camera,
+    both are equal. For a checkpoint that records no training distances, only the size of training
+    images is used.
+
+    Args:
+        checkpoint: Checkpoint of the network.
+        K: Camera matrix of the image, pixels.
+        image: Image, of which only the size is used.
+        distances: Nearest and farthest expected depth, metres (default: the training distances).
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -296,8 +308,10 @@ def letterboxes(
 def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
     """Merge the detections of all image sizes, and keep the best of each instance, best first.
 
-    Detections of two image sizes belong to one instance if their centres are closer than half the
-    larger extent.
+    Detections from different image sizes belong to one instance if :func:`are_same`.
+
+    Args:
+        scales: Detections of each image size, in pixels of the whole image.
     """
     ranked = [(detection, scale) for scale, group in enumerate(scales) for detection in group]
     ranked.sort(key=lambda pair: -pair[0].score)
@@ -331,8 +345,13 @@ def _depths(
 def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Sequence[float]:
     """Return the smallest set of scales at which a part has a size seen in training at all depths.
 
-    ``reach`` is the part's length on the image at a depth of one metre, pixels. At the middle depth
-    of a scale's range, the part has the middle size.
+    Each scale covers an equal ratio of depths. At the geometric mean of these depths, the part has
+    the geometric mean of the sizes seen in training.
+
+    Args:
+        seen: Sizes of the part in training.
+        reach: Length of the part on the image at a depth of one metre, pixels.
+        depths: Nearest and farthest depth, metres.
     """
     near, far = depths
     learned = math.log(MARGIN**2 * seen.largest_px / seen.smallest_px)
@@ -343,7 +362,11 @@ def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Se
 
 
 def are_same(first: Detection, second: Detection) -> bool:
-    """Return whether names agree and centroids are closer than half the larger extent (pixels)."""
+    """Return whether two detections on one image show the same instance.
+
+    The names must agree, and the projected centroids must be closer than half the extent of the
+    larger cuboid, pixels.
+    """
     distance = np.linalg.norm(first.keypoints[-1] - second.keypoints[-1])
     extents = [np.ptp(detection.keypoints[:-1], axis=0).max() for detection in (first, second)]
     return first.object == second.object and bool(distance < max(extents) / 2)

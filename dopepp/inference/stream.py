@@ -55,7 +55,7 @@ def stream(
         source: Path, glob pattern, camera number, URL, or opened frame source.
         K: Camera matrix of undistorted images, pixels.
         camera: Camera or camera file, instead of K (default: the camera of a recording).
-        options: See :class:`StreamOptions`.
+        **options: Entries of :class:`StreamOptions`.
 
     Raises:
         UserError: The source cannot be read, or K does not belong to its images.
@@ -87,7 +87,15 @@ def _process(
     lens: Lens,
     options: StreamOptions,
 ) -> PoseResult:
-    """Detect or track the parts in one frame."""
+    """Detect the parts in one frame or, with a tracker, track them.
+
+    Args:
+        estimator: Estimator with the minimum score of the options.
+        tracker: Tracker of the source; None without tracking.
+        frame: Frame of the source.
+        lens: Camera of the source.
+        options: Options of :func:`stream`.
+    """
     before, start = dict(estimator.spent_ms), time.perf_counter()
     image, K = lens.undistort(frame.image)
     estimator.spent_ms["pre"] += 1000 * (time.perf_counter() - start)

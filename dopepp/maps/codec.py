@@ -132,8 +132,9 @@ def find_peaks(
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
     A peak is a cell not below its eight neighbours. Among equal cells, as on a top that is clamped
-    to 1, the peak is the cell with the highest sum of 5×5 cells (usually the middle cell), or else
-    the first cell in raster order. A Gaussian fit to the neighbourhood gives the position.
+    to 1, the peak is the cell with the highest sum of the 5×5 cells around it (usually the central
+    cell of the top), or else the first cell in raster order. A Gaussian fit to the neighbourhood
+    gives the position.
 
     Objects have nine belief channels and 16 field channels; without ``field``, ``toward`` is zero.
     """
@@ -197,7 +198,17 @@ def _find(
 
 @compiled()
 def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> int:
-    """Write belief, column, row of maxima above ``threshold``, highest first; return the count."""
+    """Write the highest local maxima above ``threshold``, by descending belief.
+
+    Args:
+        belief: Belief map of a channel, (height, width).
+        threshold: Belief that a maximum exceeds.
+        score: Filled with the beliefs of the maxima, (peaks,).
+        cells: Filled with (column, row) of the maxima, (peaks, 2).
+
+    Returns:
+        The number of maxima, at most the length of ``score``.
+    """
     count = 0
     for y in range(belief.shape[0]):
         for x in range(belief.shape[1]):

@@ -211,8 +211,16 @@ def _fit_logarithm(
 ) -> None:
     """Fit the logarithm of a Gaussian to the usable cells by weighted linear least squares.
 
-    ``theta`` receives the coefficients of (1, x, y, −x², −xy, −y²). ``window`` has the beliefs over
-    the peak's belief; ``noise``, their variance, weights the prior of the shape.
+    Args:
+        window: Beliefs around the peak, relative to the peak's belief, (side, side).
+        logarithm: Logarithms of ``window``, at least log :data:`FLOOR`.
+        usable: Whether each cell belongs to the peak.
+        sigma: Standard deviation of a target peak, cells.
+        noise: Variance of the values in ``window``, which weights the prior of the shape.
+        work: Workspace for sums over the cells, (5, 10).
+        workspace: Workspace of the solver, (11, 6).
+        theta: Filled with the coefficients of (1, x, y, −x², −xy, −y²); x and y in cells from the
+            central cell.
     """
     side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
     theta[:] = 0.0
@@ -230,7 +238,7 @@ def _fit_logarithm(
     _system(work, theta, noise, sigma, hessian, workspace[0])
     solve_inside(hessian, workspace[0], 0.0, workspace[1], workspace[4:])
     theta += workspace[1]
-    if work[0, 0] == 0.0:  # a clamped top only, without slopes
+    if work[0, 0] == 0.0:  # no usable cells: the window shows only a clamped top, without slopes
         theta[:] = 0.0
 
 
@@ -247,8 +255,10 @@ def _linearised(
 ) -> tuple[float, float]:
     """Write gradient and Hessian of a Gaussian fit to the beliefs, linearised at ``theta``.
 
-    Returns the sum of squared residuals and the number of usable cells; arguments are as in
-    :func:`_fit_logarithm`.
+    The other arguments are those of :func:`_fit_logarithm`.
+
+    Returns:
+        The sum of squared residuals, and the number of usable cells.
     """
     side, half = len(window), len(window) // 2
     squared, used = 0.0, 0.0
@@ -328,10 +338,17 @@ def _system(
 
 @compiled()
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
-    """Return x and y of the maximum from the window's middle, cells, and whether the fit is sound.
+    """Return (x, y) of the fitted maximum, and whether the fit is sound.
 
-    The fit is sound if it has a maximum near the centre of the cells that are as high as the peak.
-    Otherwise, this centre is returned.
+    The fit is sound if it has a maximum near the mean position of the cells that are as high as the
+    peak. Otherwise, this mean position is returned.
+
+    Args:
+        window: Beliefs around the peak, relative to the peak's belief; NaN outside the map.
+        theta: Coefficients of the fit; see :func:`_fit_logarithm`.
+
+    Returns:
+        x and y relative to the window's central cell, cells, and whether the fit is sound.
     """
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
@@ -347,7 +364,7 @@ def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
     x = (c * theta[1] - b * theta[2]) / determinant
     y = (a * theta[2] - b * theta[1]) / determinant
     smallest = 0.5 * (a + c - math.sqrt((a - c) ** 2 + 4 * b * b))
-    # The cell of a clamped top may be any of its cells.
+    # The peak's cell may be any cell of a clamped top.
     reach = 1.0 if count < PLATEAU else 2.0
     if smallest > MIN_CURVATURE and abs(x - across) <= reach and abs(y - down) <= reach:
         return x, y, True
@@ -404,6 +421,7 @@ def _covariance(
 
 @compiled()
 def _product(left: Array, right: Array) -> float:
+    """Return the dot product of two vectors of six numbers."""
     total = 0.0
     for k in range(6):
         total += left[k] * right[k]

@@ -32,7 +32,7 @@ CornerPeaks = Float[np.ndarray, "8 peaks 2"]
 Corners = Float[np.ndarray, "instances 8 2"]
 
 MIN_DEVIATION: Final = 0.05  # smallest standard deviation of a vector's direction, radians
-POSITION_PX: Final = 1.0  # standard deviation of positions, which rotates directions to a centroid
+POSITION_PX: Final = 1.0  # standard deviation of positions, for directions to near centroids
 MIN_LENGTH: Final = 1e-3  # a shorter mean vector has no direction
 PREDICTION_PX: Final = 4.0  # deviation of a keypoint from its prediction: half a cell of stride 8
 CANDIDATES: Final = 3  # number of peaks per corner, by belief and direction, that form triples
@@ -124,7 +124,18 @@ def select_peaks(
 def solve_instances(
     peaks: ObjectPeaks, cuboid: Cuboid, K: CameraMatrix, max_angle: float, coincident_px: float
 ) -> list[tuple[KeypointGroup, PnPResult]]:
-    """Group peaks into instances by :func:`direction_evidence` and solve their poses by PnP."""
+    """Group peaks into instances by :func:`direction_evidence` and solve their poses by PnP.
+
+    Args:
+        peaks: Corner peaks and centroids of the object on one image.
+        cuboid: Keypoints of the object, object frame, metres.
+        K: Camera matrix of the network's input, pixels.
+        max_angle: See :func:`direction_evidence`.
+        coincident_px: See :func:`direction_evidence`.
+
+    Returns:
+        Keypoints and PnP result of each centroid; the result has no pose if PnP failed.
+    """
     if not len(peaks.centroid):
         return []
     evidence = direction_evidence(peaks, max_angle, coincident_px)

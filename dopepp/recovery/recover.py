@@ -87,13 +87,18 @@ def recover(
         K: Camera matrix of the network's input, pixels.
         stride: Pixels of the network's input per cell.
         names: Names of the objects (default: their indices).
-        depths: Nearest and farthest depth of each object, metres. Poses of instances with a clear
-            centroid whose score is below :data:`PROBABLE` are also searched in this range
-            (:mod:`~.search`), as ``Detection.alternative``. None (the default): no search.
+        depths: Nearest and farthest depth of each object, metres. In this range, :mod:`~.search`
+            searches a second pose of each instance with a clear centroid and a score below
+            :data:`PROBABLE`. This pose becomes ``Detection.alternative``, or the detection itself
+            if PnP gives no pose with the minimum score. None (the default): no search.
         **options: Fields of :class:`RecoveryOptions`.
 
     Returns:
         Detections of all objects, by descending score.
+
+    Raises:
+        ValueError: The shapes of maps, cuboids and K, or the number of names, disagree.
+        UserError: An option is unknown or out of range.
     """
     camera = np.asarray(K)[None]
     return recover_batch(
@@ -138,8 +143,8 @@ def recover_batch(
     for image, camera in enumerate(K):
         detections: list[Detection] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
-            own_peaks = select_peaks(peaks, image, c, chosen.centroid_threshold, cells, stride)
-            instances = solve_instances(own_peaks, cuboid, camera, max_angle, float(stride))
+            object_peaks = select_peaks(peaks, image, c, chosen.centroid_threshold, cells, stride)
+            instances = solve_instances(object_peaks, cuboid, camera, max_angle, float(stride))
             beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
             reach = None if depths is None else depths[c]
             search: PoseSearch | None = None  # made for the first uncertain instance
@@ -151,12 +156,12 @@ def recover_batch(
                     if search is None:
                         maps = beliefs.float().cpu().numpy()
                         search = PoseSearch(maps, cuboid, camera, stride, reach)
-                    solved = search.solve(group, own_peaks)
-                    other = make_detection(*solved, cuboid, camera, name, chosen)
+                    solved = search.solve(group, object_peaks)
+                    searched = make_detection(*solved, cuboid, camera, name, chosen)
                     if detection is None or detection.score < chosen.min_score:
-                        detection = other
+                        detection = searched
                     else:
-                        detection = replace(detection, alternative=other)
+                        detection = replace(detection, alternative=searched)
                 if detection is not None and detection.score >= chosen.min_score:
                     detections.append(detection)
                 elif reasons is not None:
@@ -274,7 +279,7 @@ def summary(silent: Sequence[Reason], num_images: int) -> str:
     """Return a line of text with the number of reasons of each kind and their highest ``best``.
 
     Args:
-        silent: One reason per image without detections.
+        silent: The main reason of each image without detections.
         num_images: Number of all images.
     """
     groups = []

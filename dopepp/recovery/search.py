@@ -1,9 +1,10 @@
 """Search for an instance's pose in the belief maps, without peaks and their association.
 
-In a heap, many corners are hidden or lie beside the corners of other parts, and too few peaks
-belong to an instance for PnP. Its centroid is still visible. At a centroid peak, the search tries
-sampled rotations at several depths, and sums the logarithms of the beliefs at the projected
-corners. A corner without belief costs little, so wrong corners of neighbours do not matter.
+In a heap, many corners are hidden or lie beside the corners of other parts, so an instance often
+has too few peaks for PnP, although its centroid is visible. At a centroid peak, the search tries
+sampled rotations at several depths. The best pose has the highest sum of the logarithms of the
+beliefs at the projected corners. A corner without belief reduces this sum only a little, and no
+corner peak has to be assigned to an instance.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ Depths = tuple[float, float]  # nearest and farthest depth, metres
 
 CLEAR: Final = 0.3  # belief of a centroid's peak from which a pose is searched
 ROTATION_DEVIATION: Final = 0.3  # standard deviation of a searched rotation, radians
-DEPTH_DEVIATION: Final = 0.08  # standard deviation of a searched depth, relative
-CENTROID_DEVIATION: Final = 0.4  # standard deviation of a centroid's peak, cells
+DEPTH_DEVIATION: Final = 0.08  # standard deviation of a searched depth, share of the depth
+CENTROID_DEVIATION: Final = 0.4  # standard deviation of a centroid peak's position, cells
 
 _NUM_ROTATIONS: Final = 6000  # neighbours are about 12° apart
-_STEP: Final = 0.17  # largest difference between logarithms of tried depths
+_STEP: Final = 0.17  # largest difference between the logarithms of neighbouring depths
 _FLOOR: Final = 0.02  # belief added before the logarithm, for corners without belief
 
 
@@ -65,9 +66,9 @@ class PoseSearch:
         self._arms = (cuboid[:NUM_CORNERS] - cuboid[CENTROID]) @ _rotations().transpose(0, 2, 1)
 
     def pose(self, centroid: Float[np.ndarray, "2"]) -> Transform:
-        """Return T_cam_obj with the highest sum of log beliefs at the corners.
+        """Return T_cam_obj (metres) with the highest sum of log beliefs at the projected corners.
 
-        ``centroid`` is (x, y) of the centroid's peak, input pixels.
+        The centroid is projected to ``centroid``, (x, y) of its peak, input pixels.
         """
         ray = np.linalg.solve(self._K, np.array([*centroid, 1.0]))
         number, rank = _search(
@@ -80,11 +81,13 @@ class PoseSearch:
     def solve(self, group: KeypointGroup, peaks: ObjectPeaks) -> tuple[KeypointGroup, PnPResult]:
         """Return an instance's searched pose in place of PnP's, with the keypoints that agree.
 
-        These are the nearest peaks within a cell of the projected keypoints.
-
         Args:
             group: Keypoints of the instance, of which only the centroid is used.
             peaks: All peaks of the object.
+
+        Returns:
+            The centroid and, for each corner, the nearest peak within a cell of its projection;
+            and the searched pose with its covariance and reprojection error.
         """
         T_cam_obj = self.pose(group.position[CENTROID])
         projected = project_keypoints(self._cuboid, T_cam_obj, self._K)
@@ -108,7 +111,14 @@ class PoseSearch:
 
 
 def search_covariance(T_cam_obj: Transform, cuboid: Cuboid, focal_px: float, stride: int) -> Array:
-    """Return the covariance of a searched pose, as in ``Detection.covariance``."""
+    """Return the covariance of a searched pose, in the form of ``Detection.covariance``.
+
+    Args:
+        T_cam_obj: Searched pose, metres.
+        cuboid: Keypoints of the part, object frame, metres.
+        focal_px: Focal length of the network's input, pixels.
+        stride: Input pixels per cell of the maps.
+    """
     arm = T_cam_obj[:3, :3] @ cuboid[CENTROID]
     centre: Vector = T_cam_obj[:3, 3] + arm
     depth, along = float(centre[2]), centre / np.linalg.norm(centre)
@@ -116,7 +126,9 @@ def search_covariance(T_cam_obj: Transform, cuboid: Cuboid, focal_px: float, str
     covariance[:3, :3] = ROTATION_DEVIATION**2 * np.eye(3)
     covariance[3:, 3:] = (CENTROID_DEVIATION * stride * depth / focal_px) ** 2 * np.eye(3)
     covariance[3:, 3:] += (DEPTH_DEVIATION * depth) ** 2 * np.outer(along, along)
-    lever = rotation_lever(-arm)  # the part rotates about its centroid, which is certain
+    # The rotation's error is about the centroid, whose position is measured, but the covariance
+    # refers to the object's origin.
+    lever = rotation_lever(-arm)
     return np.asarray(lever @ covariance @ lever.T)
 
 
@@ -136,9 +148,16 @@ def _rotations() -> Float[np.ndarray, "rotations 3 3"]:
 def _search(
     gains: Array, arms: Array, ray: Array, depths: Array, K: Array, stride: float
 ) -> tuple[int, int]:
-    """Return the indices of the rotation and of the depth with the highest sum over the corners.
+    """Return the indices of the rotation and of the depth with the highest sum of gains.
 
-    ``arms[r, k]`` is the vector from the centroid to corner k under rotation r, metres.
+    Args:
+        gains: Logarithm of each corner's belief, 0 without belief, (8, height, width).
+        arms: Vectors from the centroid to the corners under each rotation, metres,
+            (rotations, 8, 3).
+        ray: Point of the centroid's viewing ray at a depth of one metre, camera frame, (3,).
+        depths: Tried depths of the centroid, metres.
+        K: Camera matrix of the network's input, pixels.
+        stride: Input pixels per cell.
     """
     rows, columns = gains.shape[1:]
     half = (stride - 1) / 2

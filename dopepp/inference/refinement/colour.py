@@ -30,7 +30,7 @@ STEPS: Final = 16  # bins per channel
 UNSEEN: Final = 0.3  # initial count of each colour in both histograms
 
 KNOWN: Final = 100.0
-"""Weight of the colours of all tiles in each tile's histogram, pixels."""
+"""Weight of the histogram of all tiles in each tile's histogram, in counted pixels."""
 
 MOST: Final = 3.0
 """Bound of the log odds (20 to 1), because neighbouring pixels are not independent."""
@@ -43,7 +43,7 @@ FEWEST: Final = 60  # smallest number of pixels of a histogram
 class Crop:
     """A part and its surroundings, cut from an image and shrunk."""
 
-    colours: RGBImage  # RGB
+    colours: RGBImage
     K: CameraMatrix  # camera matrix of the crop, pixels
     extent: float  # longer side of the part, pixels of the crop
     scale: float  # crop pixels per image pixel: 1/n for an integer n
@@ -126,7 +126,7 @@ def log_odds(
     Returns:
         Log odds in [-3, 3]; None if part or surroundings have too few pixels on the image.
     """
-    thinned = math.ceil(max(mask.shape) / LONGEST_PX)
+    thinned = math.ceil(max(mask.shape) / LONGEST_PX)  # use every n-th pixel of rows and columns
     reduced_mask, unsure, ring = mask[::thinned, ::thinned], unsure / thinned, ring / thinned
     left, top, width, height = cv2.boundingRect(reduced_mask)
     reach = math.ceil(1.1 * (unsure + ring)) + 2  # OpenCV's distances are up to 5 % too short
@@ -137,7 +137,7 @@ def log_odds(
     reduced_mask = np.ascontiguousarray(reduced_mask[counted])
     within = cv2.distanceTransform(reduced_mask, cv2.DIST_L2, 3)
     beyond = cv2.distanceTransform(1 - reduced_mask, cv2.DIST_L2, 3)
-    # A slender part keeps the inner half of its width.
+    # Of a slender part, at least the inner half of its width is counted.
     unsure_within = min(unsure, 0.5 * float(within.max()))
     columns = _tile_of(bins.shape[1], left * thinned, width * thinned, tiles)
     rows = _tile_of(bins.shape[0], top * thinned, height * thinned, tiles)

@@ -1,11 +1,12 @@
 """Refinement of one pose on several images of a static scene with known camera poses.
 
 The unknown is the part's pose in the world. Every view contributes the terms of a single image,
-with its own errors of offset and scale. A step of the solver is a rotation about the object's
-origin and a shift of the origin. To apply it in a camera, only its axes are turned.
+with separate errors of offset and scale. A step of the solver is a rotation about the object's
+origin and a shift of the origin, in world axes. In a camera, the same step has rotated axes.
 
-The error of a camera's pose moves the part in this camera alone. It is normally distributed with a
-stated covariance. Eliminating the error from the view's equations adds its covariance to theirs.
+The error of a camera's pose changes the part's pose in this camera only. The error is normally
+distributed with a given covariance. Its elimination adds this covariance to the covariance of the
+pose that the view's equations imply.
 """
 
 from __future__ import annotations
@@ -197,6 +198,14 @@ def refine_views(
 class _ViewSearch:
     """Rounds of refinement on one view, with the term of its depth image.
 
+    Args:
+        number: Index of the view.
+        view: Image with the pose of its camera.
+        region: Refiner of the part.
+        T_world_obj: Start pose in the world, metres.
+        covariance: Covariance of the start pose, world axes.
+        weights: Weights of colours and edges.
+
     Raises:
         UndecidedError: Too little of the outline is on the image.
     """
@@ -228,7 +237,7 @@ class _ViewSearch:
         self._depth = [evidence.term(evidence.visible(self._start.T_cam_obj))]
 
     def round(self, left: int) -> Round:
-        """Return the round that ``left - 1`` rounds follow, or the first of fewer rounds."""
+        """Return the round with ``left - 1`` rounds after it; the first if there are too few."""
         return self.rounds[max(0, len(self.rounds) - left)]
 
     def learn(self, T_world_obj: Transform, left: int) -> bool:
@@ -254,12 +263,15 @@ class _ViewSearch:
 
 
 def _disagreements(end: Solution, prior: Prior, owners: Sequence[int]) -> dict[int, float]:
-    """Return each view's Mahalanobis distance per √degree of freedom from other views and prior.
+    """Return how much each view contradicts the other views and the prior.
 
     Args:
         end: Pose with the equations of each term.
         prior: Prior of the descent.
         owners: Index of the view of each term.
+
+    Returns:
+        Mahalanobis distance per √degree of freedom by index of the view; empty for a single view.
     """
     distances: dict[int, float] = {}
     gradient = prior.information @ prior.offset(end.T_cam_obj)

@@ -1,11 +1,13 @@
 """The outline of a mesh at a pose: its silhouette, and points on the silhouette's border.
 
-The border of the triangles that face the camera winds around a pixel as often as they cover it, so
-only the few edges on this border are filled, row by row. They cover the whole silhouette of a
-closed mesh. In an open mesh, the triangles that face away are filled in the same way.
+The border of the triangles that face the camera winds around a pixel as often as these triangles
+cover the pixel. The silhouette of a closed mesh is therefore filled row by row from the few edges
+on this border, without drawing triangles. In an open mesh, the triangles that face away are filled
+in the same way.
 
-An edge can belong to the outline if exactly one of its triangles faces the camera, or if it has one
-triangle only. It belongs if the filled mask ends there, and not if the mask is on both sides.
+An edge is a candidate for the outline if exactly one of its triangles faces the camera, or if it
+has only one triangle. It belongs to the outline where the filled mask ends, and not where the mask
+is on both sides.
 """
 
 from __future__ import annotations
@@ -29,10 +31,10 @@ WINDOW_PX: Final = 3.0
 """Radius of the disc of the mask that determines a point's outward direction."""
 
 BESIDE_PX: Final = 1.25
-"""Distance from the outline at which the mask must differ on both sides."""
+"""Distance from an outline point at which the mask must be 1 on the inside and 0 on the outside."""
 
 LONG_PX: Final = 4.0
-"""Smallest length of an edge that determines the normal; shorter edges zigzag."""
+"""Length from which an edge determines the normal; the directions of shorter edges vary."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +322,7 @@ def _walk(
                     for c in range(7):
                         longer[k, c] = rows[k, c]
                 rows = longer
-            # Perspective: halfway on the image is not halfway in space.
+            # In perspective, the middle of an edge on the image is not its middle in space.
             zi, zj = arms[i, 2] + distance, arms[j, 2] + distance
             share = share * zi / (share * zi + (1.0 - share) * zj)
             for c in range(3):
@@ -353,7 +355,7 @@ def _outward(
     height, width = mask.shape
     if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
         return False
-    # Filled pixels in the disc lie, on average, on the inside.
+    # The mean of the filled pixels in the disc lies on the inside of the border.
     x = y = 0.0
     for row in range(math.ceil(v - WINDOW_PX), math.floor(v + WINDOW_PX) + 1):
         for column in range(math.ceil(u - WINDOW_PX), math.floor(u + WINDOW_PX) + 1):
@@ -385,8 +387,8 @@ def _outward(
 def _rows(arms: Array, normals: Array, T: Array, K: Array, rows: Array) -> None:
     """Write the derivatives of each point's motion along its normal by the pose.
 
-    By the shift, it is n·du with du = f (dX/Z − X dZ/Z²). By the rotation, it is the cross product
-    of the arm and this vector.
+    The derivative by the shift is the vector d with d·dX = n·du, where du = f (dX/Z − X dZ/Z²) is
+    the motion on the image. The derivative by the rotation is the cross product of arm and d.
 
     Args:
         arms: Points relative to the object's origin, camera axes, metres.

@@ -1,8 +1,8 @@
 """Surface of a part as points, and its comparison with a depth image.
 
-Points are used because checkpoints of parts without a mesh contain nothing else. Every point
-represents a disc of the surface around it. A point is hidden if discs of other points lie in front
-of it on its ray.
+Surface points are used because every checkpoint contains them, also for a part without a mesh. Each
+point represents a disc of the surface around it. A point is hidden if the discs of at least two
+other points lie in front of it on its viewing ray.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ NOISE: Final = 2e-3
 
 MIN_NOISE: Final = 1e-3  # metres: quantisation and distortion
 GATE: Final = 3.0  # standard deviations within which depth agrees with the part
-BESIDE: Final = 6.0  # width around the part that is compared with its surface
+BESIDE: Final = 6.0  # width of the surroundings that are compared with the part's surface
 EXTENDED: Final = 4.0  # largest depth difference between a point and its extended plane
 COVERED: Final = 1.0  # distance of a pixel from the nearest point that counts as covered
 
@@ -162,8 +162,8 @@ class SurfaceOverlay:
     def continues(self, noise: float, reach: float) -> Mask:
         """Return the pixels next to the part whose depth continues the part's surface.
 
-        Pixels are compared with the offset of the adjacent surface. Otherwise the table could look
-        like a continuation of the part while the pose is still tilted.
+        A pixel's offset is compared with the offset of the adjacent point, not with 0. Otherwise, a
+        table under the part could look like a continuation of a part whose pose is still tilted.
 
         Args:
             noise: Standard deviation of the depth, metres.
@@ -235,7 +235,7 @@ def _hide(
     spacing: float,
     is_visible: Array,
 ) -> None:
-    """Write which points are visible: points that fewer than two discs around other points hide.
+    """Write which points are visible: those that fewer than two discs of other points hide.
 
     Args:
         points: Points of the posed part, camera frame, metres.

@@ -3,12 +3,12 @@
 ``region`` uses the outline on the image, ``depth`` a depth image. With both terms:
 
 1. The pose is refined on the image alone.
-2. If the image does not determine the pose, or moves it too far from the measured surface, the pose
-   is refined on depth alone instead.
-3. The result is refined on both.
+2. The result is refined on image and depth together. If the image does not determine the pose, or
+   moves the pose too far from the measured surface, the start is the pose from depth alone instead.
+3. A term that does not determine the pose is left out: without depth values on the part, the image
+   alone refines the pose; if part and background have the same colour, depth alone does.
 
-A term that does not determine the pose is left out. Without depth, the image refines alone. If part
-and background have the same colour, depth refines alone.
+To add a term, extend :data:`TERMS` and :class:`PartRefiner`.
 """
 
 from __future__ import annotations
@@ -116,13 +116,23 @@ class Refiner:
     def __call__(
         self, detection: Detection, image: RGBImage, K: CameraMatrix, depth: Depth | None
     ) -> Detection:
-        """Return the refined, verified detection, or the detection with the reason for failure."""
+        """Refine and verify a detection.
+
+        Args:
+            detection: Detection of a network, of templates, or of a tracker's last frame.
+            image: RGB, without distortion.
+            K: Camera matrix, pixels.
+            depth: Metres along z, aligned to the image, 0 where unknown.
+
+        Returns:
+            The detection at the refined pose, or at the given pose with the reason ``kept``.
+        """
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
-        is_tracked = detection.agreement is not None  # set by refinement only
+        is_tracked = detection.agreement is not None  # only refinement sets the agreement
         prior, starts = covariance, None
-        if not is_tracked and np.isfinite(detection.peaks).any():  # of a network, not a template
-            # A tracker knows how far a part may have moved; a network's covariance may be wrong.
+        if not is_tracked and np.isfinite(detection.peaks).any():  # templates have no peaks
+            # A tracker predicts how far a part moves, but a network's covariance may be too small.
             starts = partial(poses_of_four, cuboid, detection.peaks, K)
             prior = LOOSER**2 * covariance
         refined = refiner.refine(image, K, T_cam_obj, prior, depth, is_tracked, starts)
@@ -145,7 +155,7 @@ class Refiner:
         return self.verified(end, image, K, moved)
 
     def coarse_fit(self, detection: Detection, image: RGBImage, K: CameraMatrix) -> float:
-        """Return the fit of a detection's outline; see :meth:`RegionRefiner.coarse_fit`."""
+        """Return how well a detection's outline fits; see :meth:`RegionRefiner.coarse_fit`."""
         region = self._refiners[detection.object].region
         assert region is not None  # the caller requires the term ``region``
         return region.coarse_fit(image, K, detection.T_cam_obj, detection.covariance)
@@ -277,7 +287,11 @@ class PartRefiner:
 
 
 def _checked(evidence: DepthEvidence, end: Solution) -> Refinement:
-    """Return the result of a descent on depth alone; raise UndecidedError if depth refutes it."""
+    """Return the result of a descent on depth alone.
+
+    Raises:
+        UndecidedError: Depth does not fit the result, or fits the start pose as well.
+    """
     evidence.check(end.T_cam_obj)
     return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
 

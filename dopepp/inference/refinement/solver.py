@@ -23,7 +23,7 @@ PoseMatrix = Float[np.ndarray, "6 6"]
 NormalEquations = tuple[PoseMatrix, Float[np.ndarray, "6"]]
 """H and g of H ξ = g, where ξ is rotation vector (radians) and shift (metres), in camera axes."""
 
-DAMPING: Final = 1e-6  # share of each unknown's information: the prior determines all of them
+DAMPING: Final = 1e-6  # share of each unknown's information; small, as the prior determines all
 ARRIVED: Final = 0.1  # standard deviations; a shorter step ends the descent
 
 # Standard deviations of a pose without covariance: radians, and diameters across and along the
@@ -32,8 +32,9 @@ UNKNOWN_ROTATION: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
 UNKNOWN_ALONG: Final = 0.30
 
-# Lower bounds, in the same units. The image does not reveal errors of calibration and CAD, and an
-# error of the focal length causes an error of the distance.
+# Lower bounds of a prior's standard deviations: radians, and diameters across and along the viewing
+# ray. The image does not reveal errors of calibration and CAD file, and an error of the focal
+# length causes an error of the distance.
 MIN_ROTATION: Final = math.radians(2.0)
 MIN_ACROSS: Final = 0.03
 MIN_ALONG: Final = 0.15
@@ -136,8 +137,14 @@ def descend(
 ) -> Solution | None:
     """Take Gauss–Newton steps on the prior and the terms from a start pose.
 
+    Args:
+        T_cam_obj: Start pose, metres.
+        prior: Distribution of the pose.
+        terms: Measurement terms, added in this order.
+        steps: Largest number of steps; steps shorter than :data:`ARRIVED` end the descent.
+
     Returns:
-        The solution after at most ``steps`` steps; None if a term has no usable measurement.
+        The solution, or None if a term has no usable measurement.
     """
     pose, information = T_cam_obj, prior.information
     step = np.zeros(6)

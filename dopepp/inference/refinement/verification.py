@@ -59,9 +59,9 @@ EVIDENCE: Final = (
 LONGEST_PX: Final = 120  # approximate length of the part on the crop
 SPACING: Final = 80.0  # number of sampled points along the part's extent
 NOISE: Final = 8.0  # gradient, grey levels per pixel, at which an edge has half its response
-SHARP: Final = math.cos(
-    math.radians(40.0)
-)  # cosine of the smallest angle between normals at a crease
+SHARP: Final = math.cos(math.radians(40.0))
+"""Cosine of the smallest angle between the normals of a crease's triangles."""
+
 SHIFTED: Final = 0.12  # distance of the shifted outlines, share of the extent
 COLOUR_PX: Final = 2.5  # distance from the outline at which colours are compared
 RING: Final = 0.2  # width of the surroundings, share of the extent
@@ -245,7 +245,17 @@ class Verifier:
         ring: UInt8[np.ndarray, "height width"],
         T_cam_obj: Transform,
     ) -> tuple[float, float]:
-        """Fit the colours inside by the surface normals; return ``shading`` and ``residual``."""
+        """Fit a linear model of the surface normals to the colours inside the outline.
+
+        Args:
+            colours: Crop of the image.
+            ids: Triangle at each pixel, −1 for none.
+            ring: 1 in the surroundings of the part, else 0.
+            T_cam_obj: Pose, metres.
+
+        Returns:
+            The features ``shading`` and ``residual`` of :data:`EVIDENCE`.
+        """
         inside = np.flatnonzero(ids >= 0)
         inside = inside[:: math.ceil(len(inside) / MAX_PIXELS)]
         normals = self._normals[ids.ravel()[inside]] @ T_cam_obj[:3, :3].T
@@ -259,7 +269,7 @@ class Verifier:
         return float(1 - unexplained / (total + NOISE**2)), residual
 
     def _spread(self, covariance: PoseMatrix, T_cam_obj: Transform) -> float:
-        """Return the feature ``spread``."""
+        """Return the feature ``spread`` of :data:`EVIDENCE` for a pose and its covariance."""
         R = T_cam_obj[:3, :3]
         moment = R @ self._moment @ R.T
         arms = np.trace(moment) * np.eye(3) - moment  # mean of |ω × p|² as a form of ω
@@ -399,7 +409,7 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
             share = left / length
             left += spacing
             u, v = x + share * dx, y + share * dy
-            # Both triangles are drawn next to a crease; an outline has one of them only.
+            # Next to a visible crease, both triangles are drawn; next to an outline, only one.
             first = second = False
             for row in range(int(v) - 1, int(v) + 3):
                 for column in range(int(u) - 1, int(u) + 3):
@@ -418,8 +428,9 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
 def _respond(gx: Array, gy: Array, lines: Array, shifts: Array, responses: Array) -> None:
     """Add to ``responses`` each point's gradient response, summed over the shifts.
 
-    A response is 1 for a strong image gradient along the point's normal, and 0 for none. Of the
-    three colour channels, the channel with the largest gradient counts.
+    A response is near 1 for a strong image gradient along the point's normal, and 0 for none. Of
+    three pixels along the normal, the pixel with the largest response counts, and of its colour
+    channels, the channel with the largest gradient.
 
     Args:
         gx: Derivative of each channel along x.

@@ -70,7 +70,13 @@ def joint_estimator(
     camera_error: tuple[float, float] | None = None,
     names: Sequence[str] | None = None,
 ) -> JointEstimator:
-    """Return the estimator of joint poses on several images; see :func:`predict_views`."""
+    """Return the estimator of joint poses on several images.
+
+    The arguments are those of :meth:`PoseEstimator.predict_views`.
+
+    Raises:
+        UserError: The estimator does not refine by region, or an argument is invalid.
+    """
     refiner = estimator.refiner
     if refiner is None or not refiner.verifies:
         fix = "load the estimator with refine='region'"
@@ -125,10 +131,18 @@ def views_result(
     identities: Sequence[int] | None = None,
     velocities: Sequence[Step] | None = None,
 ) -> ViewsResult:
-    """Return parts with the views that show them; see :class:`ViewsResult`.
+    """Return the result of a set of images, with each part drawn in the views that show it.
 
-    ``before`` is ``estimator.spent_ms`` before the images. Each view has an equal share of the
-    time.
+    Args:
+        estimator: Estimator of the parts.
+        joint: Estimator of joint poses on the images.
+        parts: Reported parts.
+        findings: Contradictions between the views.
+        weaker: Parts that are not reported.
+        before: ``estimator.spent_ms`` before the images; every view gets an equal share of the time
+            since then.
+        identities: Number of each tracked part (default: not tracked).
+        velocities: Motion of each tracked part per set of images, world axes.
     """
     assert estimator.refiner is not None
     shapes = {

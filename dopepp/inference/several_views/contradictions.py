@@ -1,9 +1,11 @@
 """Contradictions between views: wrong or swapped camera poses, and moved parts.
 
-Two views contradict each other if they show a part of the same name at different poses, the
-covariances do not explain the difference, and one view shows something else at the other view's
-pose. If the two views agree on no part, a camera pose is wrong, and the detections that depend on
-this camera pose are rejected. If the views agree on another part, the contradicting part was moved.
+Two views contradict each other if three conditions hold: they show a part of the same name at
+different poses, the covariances do not explain the difference, and one view shows something else
+where the other view's pose puts the part.
+
+If the two views agree on no part, a camera pose is wrong, and the detections that depend on this
+camera pose are rejected. If the views agree on another part, the contradicting part was moved.
 """
 
 from __future__ import annotations
@@ -114,7 +116,11 @@ def _support(detection: WorldDetection) -> list[int]:
 
 
 def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None:
-    """Return how two detections contradict each other (see the module), or None."""
+    """Return the contradiction of two detections, or None if their views do not contradict.
+
+    Of several pairs of views that contradict, a pair in which both views show something else at the
+    other's pose is preferred.
+    """
     if first.object != second.object or separation(first.pose, second.pose) <= CONSISTENT:
         return None
     conflicts = []

@@ -34,11 +34,12 @@ SUPPORTING: Final = 0.2
 
 AGREEING: Final = 0.7
 """Smallest agreement of the outline (:class:`OutlineAgreement`) at which a view supports a pose. At
-correct poses it is above 0.9. If a camera is off by 4 mm at 20 cm, it is below 0.7 in one view."""
+correct poses, the agreement is above 0.9. If a camera's position has an error of 4 mm at a distance
+of 20 cm, the agreement is below 0.7 in one view."""
 
 WEAKER: Final = (0.5, 0.15)
-"""A view with a detection also supports a slightly worse pose: factor on the probability of the
-detection, and decrease of its agreement."""
+"""Factor on the probability and decrease of the agreement of a view's detection, down to which the
+view also supports the joint pose."""
 
 CONSISTENT: Final = 4.5
 """Largest Mahalanobis distance at which the covariances of two poses explain their difference."""
@@ -155,7 +156,7 @@ class JointEstimator:
                 if len(agreeing) > 1:
                     separations = [geometry.separation(pose, item.pose) for item in agreeing]
                     disagreement = max(disagreement, min(separations) / math.sqrt(6))
-                # A disagreement above 1 shows errors larger than stated: scale the covariance up.
+                # Above 1, errors are larger than their covariances: increase the covariance.
                 looser = Prior(pose.T_cam_obj, pose.information / max(1.0, disagreement) ** 2)
                 return self._part(agreeing, looser, evidence, disagreement)
             several = len(supporting & selected) > 1
@@ -322,8 +323,13 @@ def _lasting_error(
 ) -> PoseMatrix:
     """Return the covariance of a tracked pose due to the errors of the camera poses, world axes.
 
-    These errors are the same on all images, so a filter does not reduce them. If errors e of the
-    views with information W pull at the pose, the pose of a part at rest is (Σ W)⁻¹ Σ W e.
+    These errors are the same on all images, so a filter does not reduce them. If the views have the
+    errors e and the information W, the pose of a part at rest has the error (Σ W)⁻¹ Σ W e.
+
+    Args:
+        joint: Pose refined on all views.
+        views: Views of ``joint``.
+        forecast: Predicted pose of the part.
     """
     total, pulled = REGULAR * forecast.information, np.zeros((6, 6))
     for view, W in zip(views, joint.informations, strict=True):

@@ -116,10 +116,18 @@ def _information(
     prior: PoseMatrix,
     scale_error: float,
 ) -> PoseMatrix | None:
-    """Return the information about the pose that the outline on an image of this size adds.
+    """Return the information about the pose that the outline on an image adds.
 
-    ``prior`` is the information before the image. Both are in camera axes. The result is None if
-    the image does not show the whole part.
+    Args:
+        mesh: Mesh of the part.
+        T_cam_obj: Pose, metres.
+        K: Camera matrix, pixels.
+        size: (width, height) of the image, pixels.
+        prior: Information about the pose before the image, camera axes.
+        scale_error: Largest relative error of the part's size or of the focal length.
+
+    Returns:
+        The information in camera axes, or None if the image does not show the whole part.
     """
     posed_mesh = posed(mesh, T_cam_obj, K)
     if posed_mesh is None:

@@ -81,6 +81,7 @@ def make_observation(view: int, detection: Detection, image: PosedImage) -> Part
     pose = _in_world(image, detection.T_cam_obj, detection.covariance)
     assert detection.start is not None
     start = _in_world(image, *detection.start)
+    # The expected squared distance of a six-dimensional error is 6.
     surprise = max(1.0, start.squared_distance(pose.T_cam_obj) / 6)
     return PartObservation(
         view, detection, pose, Prior(start.T_cam_obj, start.information / surprise)
@@ -102,7 +103,7 @@ def separation(first: Prior, second: Prior) -> float:
 def associate(
     views: Sequence[Sequence[PartObservation]], geometries: Mapping[str, PartGeometry]
 ) -> list[list[PartObservation]]:
-    """Group observations by part: same name, and poses within :data:`GATE` of the best detection.
+    """Group observations of one name with poses within :data:`GATE` of the best observation's pose.
 
     Args:
         views: Observations of each view.

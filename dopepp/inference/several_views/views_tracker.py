@@ -1,8 +1,8 @@
 """ViewsTracker: tracks parts in the world through synchronised images of several posed cameras.
 
-Parts are tracked as in one camera (:mod:`dopepp.inference.tracker`), but all views that show a part
-refine its pose together. The network is run on the images, or around doubtful parts, where the
-tracker of one camera would run it.
+Parts are tracked as with one camera (:mod:`dopepp.inference.tracker`), but a part's pose is refined
+on all views that show it. The network is run as often as with one camera: on whole images, or on
+the regions around doubtful parts.
 """
 
 from __future__ import annotations

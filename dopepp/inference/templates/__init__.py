@@ -53,11 +53,11 @@ from dopepp.inference.templates.views import (
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
-COARSE_PX: Final = 80.0  # largest diameter of the part on the searched image; larger: shrink it
-FINE_PX: Final = 140.0  # largest diameter of the part on the image for ranking
+COARSE_PX: Final = 80.0  # diameter of the part above which the image is shrunk for the search
+FINE_PX: Final = 140.0  # diameter of the part above which the image is shrunk for the ranking
 SMALLEST_PX: Final = 12.0  # smallest diameter that templates can detect
 SCALE_STEP: Final = 1.13  # ratio of neighbouring distances
-PERSPECTIVE: Final = 0.15  # step of diameter over distance between two sets of drawings
+PERSPECTIVE: Final = 0.15  # difference of diameter / distance between two sets of drawings
 OCTAVE: Final = 2.0  # largest ratio of the diameters that are ranked on the same resized image
 COARSE_SPREAD: Final = 5  # `spread` of the edges in the search, pixels
 FINE_SPREAD: Final = 3  # `spread` of the edges in the ranking, pixels
@@ -69,7 +69,7 @@ NUM_STARTS: Final = 60  # start poses
 
 # Two start poses that differ by less are duplicates: refinement would move both to the same pose.
 SAME_PLACE: Final = 0.1  # diameters
-SAME_DEPTH: Final = 0.05  # relative
+SAME_DEPTH: Final = 0.05  # share of the depth
 SAME_TURN: Final = math.radians(10.0)
 
 SILHOUETTE_PX: Final = 64  # diameter of the part where its area is measured
@@ -77,7 +77,7 @@ SILHOUETTE_PX: Final = 64  # diameter of the part where its area is measured
 # Standard deviations of a start pose.
 TURN_ERROR: Final = math.radians(6.0)
 PLACE_ERROR: Final = 0.02  # diameters
-DEPTH_ERROR: Final = 0.03  # relative
+DEPTH_ERROR: Final = 0.03  # share of the depth
 
 
 class TemplateDetector:
@@ -154,7 +154,13 @@ class TemplateDetector:
         return [self.start(transforms[i], float(scores[i]), K) for i in chosen]
 
     def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:
-        """Return a detection at a pose, with the covariance of start poses."""
+        """Return a detection at a pose, with the covariance of start poses and without peaks.
+
+        Args:
+            T_cam_obj: Pose, metres.
+            score: Score of the detection, in [0, 1].
+            K: Camera matrix, pixels.
+        """
         depth = float(T_cam_obj[2, 3])
         deviations = (
             [TURN_ERROR] * 3 + [PLACE_ERROR * self.part.diameter] * 2 + [DEPTH_ERROR * depth]
@@ -250,8 +256,13 @@ class TemplateDetector:
     def _ranked_octave(self, image: RGBImage, matches: Matches) -> tuple[Matches, Features]:
         """Move matches of similar size, and replace views of the best by neighbouring views.
 
+        Args:
+            image: RGB.
+            matches: Matches whose sizes differ by at most a factor of ``OCTAVE``.
+
         Returns:
-            The best moved matches, followed by the same matches with replaced views, and features.
+            The best moved matches, followed by the same matches with replaced views, and the
+            features of both.
         """
         scale = min(1.0, FINE_PX / matches.poses[:, 3].max())
         small = _resized(image, scale)
@@ -264,13 +275,16 @@ class TemplateDetector:
         improved, after = improve_views(matches, self._templates, responses, small)
         both = _concatenate([matches, improved])
         both.poses[:, [0, 1, 3]] /= scale
-        # Better neighbouring views exist for wrong matches, too: half of the gain counts.
+        # Wrong matches also have neighbouring views that fit better, so half of the gain counts.
         return both, np.concatenate([before[best], (before[best] + after) / 2])
 
     def _matches(self, image: RGBImage, size: float, nearness: float) -> Matches:
         """Return the best matches of all templates at one distance.
 
-        ``size`` is the projected diameter, pixels; ``nearness`` is the diameter / the distance.
+        Args:
+            image: RGB.
+            size: Projected diameter of the part at this distance, pixels.
+            nearness: Diameter divided by the distance, which selects the set of drawings.
         """
         most = math.sqrt(MAX_PIXELS / (image.shape[0] * image.shape[1]))
         scale = min(1.0, most, COARSE_PX / size)
@@ -319,7 +333,13 @@ def distinct_poses(
     part: Part,
     most: int | None = None,
 ) -> list[int]:
-    """Return the indices of the first ``most`` poses that do not duplicate an earlier pose."""
+    """Return the indices of the first ``most`` poses that do not duplicate an earlier pose.
+
+    Args:
+        transforms: Poses T_cam_obj, best first.
+        part: Part, whose diameter and centre define duplicates (``SAME_PLACE`` and others).
+        most: Largest number of poses (default: all).
+    """
     poses = np.reshape(transforms, (-1, 4, 4))
     centres = poses[:, :3, :3] @ part.cuboid[-1] + poses[:, :3, 3]
     free, chosen = np.ones(len(poses), bool), []
@@ -342,7 +362,12 @@ def distinct_poses(
 def _half_turns(
     centre: Float[np.ndarray, "3"], group: Float[np.ndarray, "symmetries 4 4"]
 ) -> list[Transform]:
-    """Return half turns about the axes through a point, except those near an element of a group."""
+    """Return half turns about the object's axes through a point, except the part's symmetries.
+
+    Args:
+        centre: Point on the three axes, object frame, metres.
+        group: Symmetries of the part; half turns near one of them are omitted.
+    """
     turns = []
     for axis in np.eye(3):
         R = 2 * np.outer(axis, axis) - np.eye(3)

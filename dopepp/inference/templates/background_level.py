@@ -1,9 +1,9 @@
-"""Smallest accepted log odds of a part's detections, measured on photos without the part.
+"""Level of the log odds at which a pose has the score 0.5, measured on photos without the part.
 
 The best of many start poses can fit an ordinary edge well, and a plain part fits more edges than an
-intricate part. Therefore a few photos that ship with the package are searched for the part. The
-``Detection.probability`` of the best poses determines the level, which the user's cache folder
-stores.
+intricate part. A few photos that ship with the package are therefore searched for the part. The
+level is the mean of the photos' largest log odds of ``Detection.probability``, plus ``MARGIN``
+standard deviations. The user's cache folder stores the level.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 NUM_PHOTOS: Final = 8
 SIZE: Final = (480, 360)  # of a photo, pixels
-PART_PX: Final = 120.0  # diameter of the part at the middle of its distances
+PART_PX: Final = 120.0  # diameter of the part at the geometric mean of its distances, pixels
 MARGIN: Final = 2.5  # distance of the level from the photos' mean, standard deviations
 LOWEST: Final = 0.0  # lower bound of the level, log odds
 VERSION: Final = 9  # part of the cache's key; increase it when search or verification change

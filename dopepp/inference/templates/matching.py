@@ -25,8 +25,8 @@ from dopepp.inference.templates.views import Templates
 NUM_ROLLS: Final = 24  # in the image plane, 15 degrees apart
 STRIDE: Final = 4  # pixels between positions
 CELL: Final = 0.2  # side of a cell, diameters
-NUM_KEPT: Final = 8  # best matches of each cell
-NUM_SUMMED: Final = 32  # points of a template, a multiple of TOGETHER
+NUM_KEPT: Final = 8  # number of best matches that each cell keeps
+NUM_SUMMED: Final = 32  # number of a template's points that are used, a multiple of TOGETHER
 TOGETHER: Final = 8  # rows that are added in one pass
 LOWEST: Final = -1e9  # below all scores
 QUANTUM: Final = 4  # unit of the summed responses
@@ -43,7 +43,7 @@ class Matches(NamedTuple):
     poses: Pose2d
     scores: Float[np.ndarray, "matches"]  # standard deviations above the template's mean
     means: Float[np.ndarray, "matches"]  # mean response of the template over the image
-    deviations: Float[np.ndarray, "matches"]  # its standard deviation
+    deviations: Float[np.ndarray, "matches"]  # standard deviation of this response over the image
 
     def at(self, rows: Int[np.ndarray, "rows"] | Bool[np.ndarray, "matches"]) -> Matches:
         """Return the matches that indices or a mask select."""
@@ -89,7 +89,14 @@ def match(responses: Responses, templates: Templates, diameter_px: float) -> Mat
 def _by_phase(
     responses: Responses, rows: int, columns: int, margin: int
 ) -> Int8[np.ndarray, "phases positions"]:
-    """Rearrange quantised responses by orientation and by row and column modulo the stride."""
+    """Rearrange quantised responses by orientation and by row and column modulo the stride.
+
+    Args:
+        responses: Responses of the image.
+        rows: Number of positions from top to bottom.
+        columns: Number of positions from left to right.
+        margin: Number of positions added on each side of the image, with a response of 0.
+    """
     bins, height, width = responses.shape
     shape = bins, rows + 2 * margin, STRIDE, columns + 2 * margin, STRIDE
     padded = np.zeros((bins, shape[1] * STRIDE, shape[3] * STRIDE), np.int8)

@@ -4,9 +4,10 @@ Each match first moves to the nearby pose with the largest mean edge response. B
 degrees apart, the views of the best matches are then replaced by neighbouring views that have a
 larger response.
 
-Edges alone do not separate the part from busy texture. Colours do: the part has even colours, and
-its surroundings differ from them. A linear model of :data:`FEATURES` ranks the matches. Its weights
-were learned from procedural parts (``benchmarks/learn_ranking.py``) and are in ``ranking.json``.
+Edges alone do not distinguish the part from busy texture, but colours do: the colours inside the
+part are uniform, and differ from the colours around it. A linear model of :data:`FEATURES` ranks
+the matches. Its weights were learned from procedural parts (``benchmarks/learn_ranking.py``) and
+are in ``ranking.json``.
 
 The compiled functions share the names of their arrays: ``maps`` are edge responses by orientation,
 row and column; ``points`` (diameters) and ``normals`` (radians) are the edge points of a view or of
@@ -36,7 +37,7 @@ FEATURES: Final = (
     "response",  # mean response of the template's points at this position
     "supported",  # share of points with a response above SUPPORT
     "texture",  # mean of the strongest response at inner points
-    "evenness",  # logarithm of the variance of the colours inside
+    "evenness",  # logarithm of the variance of the colours inside; low for uniform colours
     "contrast",  # difference of the colours on both sides of the outline, in [0, 1]
     "separation",  # difference between the colours outside and the mean colour inside, in [0, 1]
     "shown",  # share of the template's points that lie on the image
@@ -46,7 +47,7 @@ FEATURES: Final = (
 
 SUPPORT: Final = 30  # response above which a point counts as supported
 LEVEL: Final = 16.0  # difference of colours, grey levels, at which the contrast is 0.5
-EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as even
+EVEN: Final = 64.0  # added to the variance of colours, so that noise counts as uniform
 MIN_INNER: Final = 8  # smallest number of inner points on the image for features of a match
 ACROSS: Final = (2.5, 0.03)  # pixels and diameters between the outline and the compared colours
 ROLL_STEP: Final = math.radians(5.0)  # step of the in-plane rotation on the grid
@@ -63,7 +64,7 @@ class RankingModel(NamedTuple):
 
     weights: Float[np.ndarray, "features"]  # weight of each of FEATURES
     bias: float  # weighted sum + bias: log odds that the best match of an image is correct
-    score: dict[str, float]  # RecoveryOptions of refined poses
+    score: dict[str, float]  # RecoveryOptions that score the refined poses
 
 
 @cache
@@ -154,8 +155,8 @@ def _response(
 ) -> float:
     """Return the mean edge response at the points of a template with its centre at pixel (u, v).
 
-    ``indices`` is overwritten. The compiler vectorises their loop because it is separate. They are
-    32-bit integers: maps have less than 2³¹ elements.
+    ``indices`` is a workspace of 32-bit integers, as maps have less than 2³¹ elements. A separate
+    loop computes the indices, so that the compiler vectorises it.
     """
     height, width, total = np.int32(maps.shape[1]), np.int32(maps.shape[2]), 0
     flat = maps.reshape(-1)

@@ -1,8 +1,8 @@
 """Responses of an image's edges, one map for each orientation.
 
-A response is high near an edge of the map's orientation (spread orientations as in LINE-2D,
-Hinterstoisser et al. 2012). The mean response of the surroundings is subtracted, because in busy
-texture every pixel is near edges of all orientations.
+A response is high near an edge of the map's orientation: orientations are spread to neighbouring
+pixels as in LINE-2D (Hinterstoisser et al. 2012). The mean response of the surroundings is
+subtracted, because in busy texture every pixel is near edges of all orientations.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ SPACING_PX: Final = 1.5  # distance between the edge points that a template's po
 INNER_PX: Final = 4.0  # distance of inner points from edges; smaller in narrow views
 MAX_INNER: Final = 400  # largest number of pixels from which inner points are chosen
 SLACK: Final = 0.02  # overlap of the regions that symmetries map to each other, cosine
-NEAREST: Final = 1.1  # smallest distance of a drawing, diameters
+NEAREST: Final = 1.1  # smallest distance from which a part is drawn, diameters
 
 Rotations = Float[np.ndarray, "views 3 3"]
 

@@ -2,12 +2,13 @@
 
 The part is represented by its surface points, which every checkpoint contains.
 
-1. A search over shifts finds the measured surface. A descent alone would converge to the nearest
-   surface, which is wrong for a plate that is 14 mm away, or 10 mm aside on a table.
+1. A search over shifts finds the measured surface. Without the search, Gauss–Newton steps converge
+   to the nearest surface, e.g. to the table if the pose of a plate is 10 mm off.
 2. Two kinds of terms are minimised (:mod:`~dopepp.inference.refinement.depth.terms`). The planes of
    the part's points determine the pose as far as the shape of the surface does. The outline in the
-   depth image keeps a plate from sliding in its plane. The image's pose and covariance determine
-   the rest.
+   depth image prevents a plate from sliding in its plane. The prior, which is the pose without
+   depth, determines the other directions.
+3. The result is rejected if it fits the depth badly, or no better than the prior's pose.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ MIN_FOUND: Final = 20  # smallest number of points that agree with their depth
 
 @dataclass(frozen=True)
 class DepthStage:
-    """A stage of the fit to depth; lengths are in diameters of the part unless stated otherwise."""
+    """A stage of the fit to depth; lengths are shares of the part's diameter if not stated."""
 
     reach: float  # distance from a plane above which a pixel has no weight
     steps: int = 2  # Gauss–Newton steps
@@ -155,7 +156,8 @@ class DepthEvidence:
         """Check that depth fits a pose well, and better than the prior's pose.
 
         Raises:
-            UndecidedError: It does not, or the pose is more than ``FARTHEST`` from the prior's.
+            UndecidedError: The depth does not fit so well, or the pose is farther than ``FARTHEST``
+                from the prior's pose.
         """
         reason = self._fit(pose, self.visible(pose)).doubt(self._before)
         distance = math.sqrt(self.prior.squared_distance(pose))

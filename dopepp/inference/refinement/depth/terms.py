@@ -3,9 +3,9 @@
 Point-to-plane terms: a pixel's residual is its distance from the plane of the visible point that it
 shows. Weights decrease to 0 at a limit, so occluders, background and outliers have no effect.
 
-Outline terms: a point with depth behind it, or a pixel next to the part that continues its surface,
-moves the part across the viewing ray. Points inside both outlines have no such term, because they
-would hold the part in place.
+Outline terms move the part across the viewing ray: from points whose measured depth is behind the
+part, and towards pixels next to the part whose depth continues the part's surface. Points inside
+both outlines have no outline term, because their terms would hold the part in place.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def outline_terms(
 ) -> NormalEquations:
     """Return normal equations of the outline terms; see :func:`plane_terms` for the arguments.
 
-    ``spacing`` is also the standard deviation of an outline point's position. Where the outlines
-    differ by more than ``reach``, a point has no weight.
+    ``spacing`` is also the standard deviation of an outline point's position. A point has no weight
+    if the measured outline is farther away than ``reach``.
     """
     gate = GATE * view.noise
     offset = overlay.at_points

@@ -1,19 +1,20 @@
 """Refinement on the image: move the outline to the border between part and background colours.
 
-1. Colours inside the part's outline and around it are learned at the pose to refine.
+1. Histograms of the colours inside the outline and around it are computed at the start pose
+   ("learned").
 2. Colours and edges along the normals of the outline show where the part ends
    (:mod:`~dopepp.inference.refinement.region.shifts`).
-3. A few Gauss–Newton steps follow, from coarse to fine, with the start pose and its covariance as
-   prior. The last round is repeated until it converges.
-4. If the image does not agree with the result, the descent is repeated from other starts with a
-   weaker prior, and the result that agrees best is returned. The covariance of a network's pose can
-   be too small, for instance if the part is occluded.
+3. A few Gauss–Newton steps follow, in rounds from coarse to fine, with the start pose and its
+   covariance as prior. The last round is repeated until it converges.
+4. If less than ``SURE`` of the outline agrees with the image, the descent is repeated from other
+   start poses with a weaker prior, and the result that agrees best is returned. This corrects poses
+   whose covariance is too small, for instance because the part is occluded.
 5. If the image does not determine the pose, the start pose is kept.
 
 Errors of neighbouring points are correlated, and all points share errors of offset and scale
-(:mod:`~dopepp.inference.refinement.region.shared_errors`). If errors were independent, a blurred
-edge or a print that is off by a percent would overrule the network's distance. Regions are used as
-in PWP3D and RBOT, and probabilistic lines as in SRT3D (Stoiber et al. 2022).
+(:mod:`~dopepp.inference.refinement.region.shared_errors`). With independent errors, a blurred edge
+or a size error of a percent would outweigh the network's distance. Regions are used as in PWP3D and
+RBOT, and probabilistic lines as in SRT3D (Stoiber et al. 2022).
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ from dopepp.parts.mesh import Faces, Vertices, largest_distance
 COARSE: Final = RegionStage(120, reach=1.0, steps=3, points=100, tiles=1)
 MIDDLE: Final = RegionStage(200, reach=0.5, steps=2, points=120, tiles=2)
 FINE: Final = RegionStage(300, reach=0.25, steps=3, points=160, tiles=3)
-"""The coarse stage is run from every start, the others from the best results only."""
+"""In the extended search, the coarse stage is run from every start, the others only from the best
+results."""
 
 STAGES: Final = (COARSE, MIDDLE, FINE)
 
@@ -73,11 +75,12 @@ NUM_CONTINUED: Final = 2  # coarse results that the other stages continue
 CERTAIN: Final = 0.95  # agreement that ends the search
 
 REACH: Final = (2.5, 0.15)
-"""Search distance: standard deviations of the outline under the prior, and its upper bound, a share
-of the outline's extent."""
+"""Search distance in standard deviations of the outline under the prior, and its upper bound as a
+share of the outline's extent."""
 
 ENOUGH: Final = 0.6
-"""Share of the search distance (1.5 standard deviations) that makes coarser rounds unnecessary."""
+"""A round is unnecessary if the next round covers this share of the search distance, which is 1.5
+standard deviations."""
 
 MAX_REPEATS: Final = 3  # repetitions of the last round, until it converges
 CONVERGED: Final = 0.4  # standard deviations that a converged round moves the pose at most
@@ -114,11 +117,12 @@ class RegionRefiner:
         followed: bool = False,
         starts: Starts | None = None,
     ) -> Refinement:
-        """Refine one pose; see :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
+        """Refine one pose on the image.
 
         If the image does not agree with poses near ``T_cam_obj``, the search is extended to the
-        poses that ``starts`` returns and to randomly sampled poses. Without ``starts``, the search
-        is not extended.
+        poses that ``starts`` returns and to poses sampled from a weaker prior. Without ``starts``,
+        the search is not extended. The other arguments and the result are those of
+        :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
         """
         given = np.asarray(T_cam_obj, np.float64)
         try:
@@ -163,10 +167,19 @@ class RegionRefiner:
     def refine_with(
         self, image: RGBImage, K: CameraMatrix, depth: DepthEvidence, start: Solution
     ) -> Outcome:
-        """Refine on image and depth together, starting at the solution of image or depth alone.
+        """Refine on image and depth together.
+
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            depth: Measured depth of the part, with the prior of the pose.
+            start: Solution of the refinement on the image or on depth alone.
+
+        Returns:
+            The solution, and the agreement of its outline with the image.
 
         Raises:
-            UndecidedError: The image does not determine the pose.
+            UndecidedError: The image does not determine the pose, or contradicts the result.
         """
         visible = depth.visible(start.T_cam_obj)
         rounds = self.rounds(image, K, start.T_cam_obj, further_terms=[depth.term(visible)])
@@ -185,7 +198,15 @@ class RegionRefiner:
         further_terms: Sequence[Term] = (),
         stages: Sequence[RegionStage] = STAGES,
     ) -> list[Round]:
-        """Return the rounds of optimisation around a pose, by default from coarse to fine.
+        """Return one round of optimisation per stage, each with its own crop around a pose.
+
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            pose: Pose T_cam_obj at which the part is cut out, metres.
+            weights: Weights of colours and edges.
+            further_terms: Solver terms in addition to the outline, e.g. depth.
+            stages: Resolutions and search distances, from coarse to fine.
 
         Raises:
             UndecidedError: The part is too small, outside the image or behind the camera.
@@ -335,7 +356,7 @@ def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: floa
     end, last = _descend(rounds, start, prior, reach), rounds[-1]
     for _ in range(MAX_REPEATS if reach > EDGE_PX else 0):
         before = end.T_cam_obj
-        # Each time, the colours are learned at a better pose, and the search distance is shortest.
+        # Each repetition learns the colours at a better pose, within the smallest search distance.
         end = _descend([last], before, prior, EDGE_PX)
         if has_converged(end, before):
             break
@@ -357,7 +378,7 @@ def _descend(rounds: Sequence[Round], start: Transform, prior: Prior, reach: flo
 
 
 def search_distance(coarse: Round, prior: Prior) -> float:
-    """Return how far from the projected contour to search for the part's outline.
+    """Return how far from the projected outline to search for the part's border on the image.
 
     Args:
         coarse: First round of the refinement, with the smallest image.

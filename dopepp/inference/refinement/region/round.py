@@ -1,4 +1,8 @@
-"""One round of refinement on the image: its crop, learned colours, outline term and final check."""
+"""One round of refinement on the image: its crop, learned colours, outline term and final check.
+
+Search distances (``reach``) are passed in pixels of the full image; :meth:`Round.reach` converts
+them to a stage's share in pixels of its crop.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +56,7 @@ FIRM: Final = (math.radians(1.0), 5e-3)
 MIN_AGREEING: Final = 0.3  # smallest agreement of a refined outline that is accepted
 AGREE_PX: Final = 2.0  # largest distance from the image's outline of a point that agrees
 
-INFORMATIVE: Final = 0.1  # pixels⁻²: information of a point that counts as support
+INFORMATIVE: Final = 0.1  # pixels⁻²: smallest information of a point that counts as support
 
 FARTHEST: Final = 4.5
 """Largest Mahalanobis distance of a refined pose from the prior's pose, in six dimensions."""
@@ -60,10 +64,10 @@ FARTHEST: Final = 4.5
 
 @dataclass(frozen=True)
 class RegionStage:
-    """Settings of one refinement round, such as resolution and search distance."""
+    """Settings of one round of refinement."""
 
-    longest_px: int  # length of the part above which the image is shrunk
-    reach: float  # length of the normals, share of the first search distance
+    longest_px: int  # length of the part above which the image is shrunk, pixels
+    reach: float  # share of the refinement's search distance that this round covers
     steps: int  # Gauss–Newton steps
     points: int  # approximate number of points on the outline
     tiles: int  # tiles along each side of the part, each with its own colours
@@ -75,7 +79,7 @@ class OutlineAgreement:
 
     share: float  # agreeing share of the image's information about the outline
     # Share of the outline with agreeing information, in [0, 1]: occluded points, and points in
-    # front of the part's own colour, have none
+    # front of a background of the part's colour, have no information
     support: float
 
 
@@ -83,12 +87,12 @@ Silhouette = tuple[PosedMesh, UInt8[np.ndarray, "height width"]]  # posed mesh a
 
 
 class Round:
-    """A stage of refinement on its crop, with the learned colours of part and surroundings.
+    """A round of refinement on a crop, with the learned colours of part and surroundings.
 
     Args:
         mesh: Mesh of the part.
         crop: Image around the part, at the stage's resolution.
-        stage: Resolution and search distance.
+        stage: Settings of the round.
         weights: Weights of colours and edges.
         more: Solver terms in addition to the outline.
         scale_error: Largest relative error of the outline's scale.
@@ -143,7 +147,7 @@ class Round:
         Raises:
             UndecidedError: The outline leaves the image.
         """
-        # The outline term is last, because its distance counts relative to the other terms.
+        # The outline term is last, because its scale error depends on the sum of all other terms.
         end = descend(start, prior, [*self._more, self.term(reach)], self.stage.steps)
         if end is None:
             raise UndecidedError("the part's outline left the image")
@@ -207,8 +211,8 @@ class Round:
             raise UndecidedError(f"{distance:.1f} standard deviations from the given pose, {limit}")
         rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
         is_near = self._is_followed and np.mean((rows @ prior.offset(end.T_cam_obj)) ** 2) < 1.0
-        # Compare with the prior's pose, except where noise would decide (a tracked part that moved
-        # less than a pixel) and where further terms may move the pose against the image.
+        # Compare with the prior's pose, except for a tracked part that moved less than a pixel,
+        # where noise would decide, and with further terms, which may contradict the image.
         if not is_near and not self._more:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
@@ -243,6 +247,11 @@ class Round:
         """Return by how much the outline increases the log determinant of the pose's information.
 
         For a tracked part, whose pose is precise, the gain is relative to a weaker prior.
+
+        Args:
+            end: End of the descent.
+            prior: Prior of the descent.
+            information: Information at the end without the outline.
         """
         added, before = end.information - information, prior.information
         if self._is_followed:
@@ -252,10 +261,7 @@ class Round:
         return float(np.linalg.slogdet(before + added)[1] - np.linalg.slogdet(before)[1])
 
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
-        """Measure where the part ends along the normals of a contour, at most ``reach`` away.
-
-        ``reach`` is in pixels of the image.
-        """
+        """Measure where the part ends along the normals of a contour, within a search distance."""
         reach, odds, colours = self.reach(reach), self._smooth_odds, self.crop.colours
         return find_shifts(odds, colours, contour, reach, _step(reach), self._weights)
 

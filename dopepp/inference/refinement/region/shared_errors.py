@@ -5,10 +5,10 @@ All points share two errors, which are unknowns with a prior:
 - Offset: blur, a halo or a mesh that is too thick move every point outwards by the same distance.
   The offset is normally distributed.
 - Scale: a larger part or focal length has the same effect on the outline as a nearer part. All
-  errors up to a limit are equally likely. The pose is corrected by the expected error: a precise
-  prior keeps its distance while prior and outline differ by less than the limit, and a broad prior
-  lets the outline determine the distance. A normally distributed error would move every distance,
-  even a correct distance, part of the way to the outline's distance.
+  errors up to a limit are equally likely. The pose is corrected by the expected error. A precise
+  prior therefore keeps its distance if prior and outline differ by less than the limit. With a
+  broad prior, the outline determines the distance. A normally distributed error would move every
+  distance, even a correct distance, part of the way to the outline's distance.
 
 Neighbouring points have errors in common, and outliers get a small weight.
 """
@@ -30,7 +30,7 @@ from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 INDEPENDENT_PX: Final = 4.0  # length of the outline within which small errors are equal
 MIN_INFORMATION: Final = 1e-3  # pixels⁻²; smaller information is ignored
 
-REWEIGHTINGS: Final = 2
+REWEIGHTINGS: Final = 2  # number of times that outliers are weighted again
 
 GATE: Final = 2.0  # standard deviations at which a point has a quarter of its weight
 

@@ -1,11 +1,11 @@
 """Shifts of the outline along its normals.
 
-Along a normal, pixels have the part's colours up to the shift d at which the part ends, and those
-of its surroundings beyond. The sum of the pixels' log odds up to d is therefore the logarithm of
-the likelihood of d, up to a constant.
+Along a normal, pixels have the part's colours up to the shift d at which the part ends, and the
+colours of its surroundings beyond. The sum of the pixels' log odds up to d is therefore the
+logarithm of the likelihood of d, up to a constant.
 
-Edges also increase the likelihood: it is higher where the image changes more than on average. They
-separate a part from surroundings of its own colour, and locate its end with subpixel accuracy.
+Edges also increase the likelihood: it is higher where the image changes more than on average. Edges
+separate a part from surroundings of its own colour, and locate the border with subpixel accuracy.
 
 The result is the mean of the shift and its information: the inverse of its variance, minus the
 inverse variance of a uniform distribution. If all shifts are equally likely, the information is
@@ -40,11 +40,11 @@ class Weights(NamedTuple):
 
 
 FOUND: Final = Weights(colour=0.5, edge=1.0)
-"""Weights for a start that may be far off: colours decide which of many edges is the part's."""
+"""Weights for an inaccurate start pose: colours decide which of many edges is the part's border."""
 
 FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
-"""Weights for a tracked part: the nearest edge is the part's, and its centre is robust to blur. For
-starts that are far off, these weights are worse than :data:`FOUND`."""
+"""Weights for a tracked part: the nearest edge is the part's border, and blur does not shift the
+edge's centre. For inaccurate start poses, these weights are worse than :data:`FOUND`."""
 
 
 @dataclass(frozen=True, eq=False)
