@@ -139,17 +139,17 @@ def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
 
 def _camera(calibration: Calibration, source: str) -> Camera:
     """Return a calibration's camera, after checking K and the number of distortion coefficients."""
-    K = pinhole_matrix(calibration.K, source)
+    size, K, lens = calibration
+    K = pinhole_matrix(K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
         problem = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
         fix = "calibrate the camera, e.g. with `dopepp calibrate camera`"
         raise UserError(problem, "focal lengths above 0 pixels", fix)
-    if len(calibration.distortion) not in COEFFICIENTS:
-        problem = f"{source}: {len(calibration.distortion)} distortion coefficients"
+    if len(lens) not in COEFFICIENTS:
+        problem = f"{source}: {len(lens)} distortion coefficients"
         allowed = f"{', '.join(map(str, COEFFICIENTS))} in OpenCV's order (k1, k2, p1, p2, k3, …)"
         raise UserError(problem, allowed, "add zeros for the missing coefficients")
-    lens = calibration.distortion if any(calibration.distortion) else ()
-    return Camera(calibration.size, K, lens, source)
+    return Camera(size, K, lens if any(lens) else (), source)
 
 
 def _read_text(path: Path) -> str:

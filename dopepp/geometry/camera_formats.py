@@ -1,6 +1,6 @@
 """Parsers of camera files: named fields (ROS, OpenCV, BOP, NDDS), COLMAP and plain numbers.
 
-The content determines the format, not the suffix. Every function returns a :class:`Calibration`,
+The content determines the format, not the suffix. Every function returns a :data:`Calibration`,
 whose lens the caller checks. Files are not trusted, so none is passed to the C++ parser
 ``cv2.FileStorage``.
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from xml.etree import ElementTree
 
 from dopepp.core.errors import UserError
@@ -43,12 +43,10 @@ _COLMAP_MODELS: Final = {
 """Number of parameters of COLMAP's models that OpenCV has as well."""
 
 
-class Calibration(NamedTuple):
-    """Image size (None if unknown), K, and distortion coefficients in OpenCV's order."""
+Calibration = tuple[Size | None, CameraMatrix, tuple[float, ...]]
+"""Image size (None if unknown), K, and distortion coefficients in OpenCV's order."""
 
-    size: Size | None
-    K: CameraMatrix
-    distortion: tuple[float, ...] = ()
+Field = tuple[str, object]  # full name, "file: field", and value
 
 
 def parse_calibration(text: str, source: str) -> Calibration:
@@ -66,7 +64,7 @@ def parse_calibration(text: str, source: str) -> Calibration:
         return _colmap(lines, source)
     numbers = _floats(re.sub(r"[\[\](),;]", " ", " ".join(map(" ".join, lines))).split())
     if numbers:
-        return Calibration(None, _matrix(numbers, source))
+        return None, _matrix(numbers, source), ()
     if text.startswith("<"):
         content: object = _xml(text, source)
     elif text.startswith("{"):
@@ -102,7 +100,7 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
         lens += [0.0] * (4 - len(lens))
     size = _side(f"{source}: width", width), _side(f"{source}: height", height)
     # COLMAP's (0.5, 0.5) is the centre of the top-left pixel.
-    return Calibration(size, camera_matrix(fx, fy, cx - 0.5, cy - 0.5), tuple(lens))
+    return size, camera_matrix(fx, fy, cx - 0.5, cy - 0.5), tuple(lens)
 
 
 def _xml(text: str, source: str) -> dict[object, object]:
@@ -136,21 +134,22 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
         UserError: The camera matrix is missing, the lens is not OpenCV's pinhole model, or a field
             does not hold numbers.
     """
-    fields = _Fields(content, source)
-    array = fields.find("camera_matrix", "K", "intrinsic_matrix", "cam_K")
-    four = [fields.find(name) for name in ("fx", "fy", "cx", "cy")]
+    fields = _named_fields(content, source)
+    array = _find(fields, "camera_matrix", "K", "intrinsic_matrix", "cam_K")
+    four = [_find(fields, name) for name in ("fx", "fy", "cx", "cy")]
     if array is not None:
         K = _matrix(_numbers(*array), array[0])
     elif all(four):
         K = camera_matrix(*(_number(*field) for field in four if field))
     else:
-        fix = f"{_FORMAT_FIX}, with one camera"
-        raise UserError(f"{source} without camera_matrix (it has {fields})", FORMATS, fix)
-    lens = fields.find(
-        "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
+        names = [name.removeprefix(f"{source}: ") for name, _ in fields.values()]
+        problem = f"{source} without camera_matrix (it has {', '.join(names[:10]) or 'no field'})"
+        raise UserError(problem, FORMATS, f"{_FORMAT_FIX}, with one camera")
+    lens = _find(
+        fields, "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
     )
     distortion = () if lens is None else tuple(_numbers(*lens))
-    fisheye, model = fields.find("fisheye_model"), fields.find("distortion_model")
+    fisheye, model = _find(fields, "fisheye_model"), _find(fields, "distortion_model")
     if fisheye is not None and fisheye[1] not in (0, "0"):
         raise UserError(f"{source}: fisheye_model=1", "a camera without a fisheye lens", _UNDISTORT)
     models: tuple[object, ...] = ("plumb_bob", "rational_polynomial")
@@ -158,35 +157,28 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
     if model is not None and model[1] not in models:
         allowed = "plumb_bob, rational_polynomial"
         raise UserError(f"{model[0]}={short_repr(model[1], 80)}", allowed, _UNDISTORT)
-    return Calibration(_size(fields), K, distortion)
+    return _size(fields, source), K, distortion
 
 
-class _Fields:
-    """Named fields of a camera file; messages name a field "file: field"."""
+def _named_fields(content: Mapping[Any, object], source: str) -> dict[str, Field]:
+    """Return the fields of a camera file by their keys (:func:`_key`)."""
+    cameras = content.get("camera_settings")
+    if isinstance(cameras, list):  # NDDS's ``_camera_settings.json``
+        camera = cameras[0] if len(cameras) == 1 else None
+        inner = camera.get("intrinsic_settings") if isinstance(camera, Mapping) else None
+        if not isinstance(camera, Mapping) or not isinstance(inner, Mapping):
+            problem = f"{source}: camera_settings with {len(cameras)} cameras"
+            fix = "delete the other cameras from a copy of the file"
+            raise UserError(problem, "one camera with intrinsic_settings", fix)
+        size = camera.get("captured_image_size")
+        content = {**inner, **(size if isinstance(size, Mapping) else {})}
+    named = {name[:40]: value for name, value in content.items() if isinstance(name, str)}
+    return {_key(name): (f"{source}: {name}", value) for name, value in named.items()}
 
-    def __init__(self, content: Mapping[Any, object], source: str) -> None:
-        self.source = source
-        cameras = content.get("camera_settings")
-        if isinstance(cameras, list):  # NDDS's ``_camera_settings.json``
-            camera = cameras[0] if len(cameras) == 1 else None
-            inner = camera.get("intrinsic_settings") if isinstance(camera, Mapping) else None
-            if not isinstance(camera, Mapping) or not isinstance(inner, Mapping):
-                problem = f"{source}: camera_settings with {len(cameras)} cameras"
-                fix = "delete the other cameras from a copy of the file"
-                raise UserError(problem, "one camera with intrinsic_settings", fix)
-            size = camera.get("captured_image_size")
-            content = {**inner, **(size if isinstance(size, Mapping) else {})}
-        named = {name[:40]: value for name, value in content.items() if isinstance(name, str)}
-        self._fields = {_key(name): (f"{source}: {name}", value) for name, value in named.items()}
-        self._names = list(named)
 
-    def __str__(self) -> str:
-        return ", ".join(self._names[:10]) or "no field"
-
-    def find(self, *names: str) -> tuple[str, object] | None:
-        """Return full name and value of the first of ``names`` that the file has, or None."""
-        keys = [_key(name) for name in names if _key(name) in self._fields]
-        return self._fields[keys[0]] if keys else None
+def _find(fields: Mapping[str, Field], *names: str) -> Field | None:
+    """Return the first of ``names`` that a file has, or None."""
+    return next((fields[_key(name)] for name in names if _key(name) in fields), None)
 
 
 def _key(name: str) -> str:
@@ -194,22 +186,22 @@ def _key(name: str) -> str:
     return name.lower().replace("_", "")
 
 
-def _size(fields: _Fields) -> Size | None:
+def _size(fields: Mapping[str, Field], source: str) -> Size | None:
     """Return the image's size in the fields of a file; None if the file has no size."""
-    both = fields.find("image_size", "resolution")
+    both = _find(fields, "image_size", "resolution")
     if both is not None:
         name, sides = both[0], _numbers(*both)
         if len(sides) != 2:
             fix = "write the image's width and height, e.g. [640, 480]"
             raise UserError(f"{name} with {len(sides)} numbers", "two numbers", fix)
         return _side(name, sides[0]), _side(name, sides[1])
-    width, height = (fields.find(f"image_{side}", side) for side in ("width", "height"))
+    width, height = (_find(fields, f"image_{side}", side) for side in ("width", "height"))
     if width is None and height is None:
         return None
     if width is None or height is None:
         missing = "image_height" if width else "image_width"
         allowed = "image_width and image_height, or neither"
-        raise UserError(f"{fields.source} without {missing}", allowed, f"add {missing}")
+        raise UserError(f"{source} without {missing}", allowed, f"add {missing}")
     return _side(*width), _side(*height)
 
 

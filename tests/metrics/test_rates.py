@@ -16,6 +16,7 @@ from dopepp.metrics.functional import (
     average_precision,
     average_recall,
     coverage,
+    expected_calibration_error,
     match,
     pass_rate,
     region_levels,
@@ -63,8 +64,11 @@ def test_auc_equals_loops(errors):
         (lambda: match(ONES, torch.zeros(3, 1), 0.1), "2 scores need as many rows"),
         (lambda: average_precision(ONES, TRUE, 1), "2 correct predictions of 1"),
         (lambda: average_precision(ONES, TRUE[:1], 1), "differ"),
+        (lambda: expected_calibration_error(1.5 * ONES, TRUE), r"\[0, 1\]"),
+        (lambda: expected_calibration_error(ONES * NAN, TRUE), r"\[0, 1\]"),
+        (lambda: expected_calibration_error(ONES, TRUE[:1]), "differ"),
     ],
-    ids=["rows", "too many", "lengths"],
+    ids=["rows", "too many", "lengths", "above 1", "NaN", "one label"],
 )
 def test_wrong_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
@@ -152,6 +156,28 @@ def test_wilsons_interval_is_scipys(counts):
     theirs = binomtest(passed, num).proportion_ci(0.95, method="wilson")
     assert (low, high) == pytest.approx((theirs.low, theirs.high), abs=1e-9)
     assert 0 <= low <= passed / num <= high <= 1
+
+
+@settings(max_examples=50)
+@given(seed=st.integers(0, 10_000), count=st.integers(1, 60))
+def test_calibration_error_is_its_definition(seed, count):
+    rng = np.random.default_rng(seed)
+    scores, correct = rng.integers(0, 41, count) / 40, rng.random(count) < 0.5
+    expected = 0.0
+    for k in range(10):
+        inside = (scores * 10 > k) & (scores * 10 <= k + 1)
+        if k == 0:
+            inside |= scores == 0
+        if inside.any():
+            expected += inside.mean() * abs(scores[inside].mean() - correct[inside].mean())
+    result = expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct))
+    assert result == pytest.approx(expected, abs=1e-12)
+
+
+def test_calibration_error_of_extreme_scores():
+    assert expected_calibration_error(ONES[:0], TRUE[:0]) == 0.0
+    assert expected_calibration_error(ONES, TRUE) == 0.0
+    assert expected_calibration_error(ONES, ~TRUE) == 1.0
 
 
 @settings(max_examples=60)

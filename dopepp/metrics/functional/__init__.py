@@ -107,6 +107,29 @@ def coverage(distances: Errors, level: float = 0.9) -> float:
     return float((levels <= level).double().mean()) if len(levels) else 0.0
 
 
+def expected_calibration_error(scores: Float[Tensor, "p"], correct: Bool[Tensor, "p"]) -> float:
+    """Return the mean gap between score and share of correct predictions (ECE; Guo 2017, Eq. 3).
+
+    Predictions are sorted into ten bins of equal width by score, and bins are weighted by size. A
+    score on an edge belongs to the lower bin. Without predictions the error is 0.0.
+
+    Raises:
+        ValueError: The lengths differ, or a score is outside [0, 1].
+    """
+    scores, correct = to_float64(scores), torch.as_tensor(correct, dtype=torch.bool)
+    if scores.shape != correct.shape or scores.ndim != 1:
+        raise ValueError(f"scores {tuple(scores.shape)} and correct {tuple(correct.shape)} differ")
+    if len(scores) == 0:
+        return 0.0
+    if not bool(((scores >= 0) & (scores <= 1)).all()):
+        raise ValueError("scores must lie in [0, 1]")
+    index = ((scores * 10).ceil().long() - 1).clamp(min=0)
+    zeros = scores.new_zeros(10)
+    confidence = zeros.index_add(0, index, scores)
+    accuracy = zeros.index_add(0, index, correct.double())
+    return float((confidence - accuracy).abs().sum() / len(scores))
+
+
 _RECALLS: Final = torch.from_numpy(np.linspace(0.0, 1.0, 101))
 """Recall levels of COCO's tool, with its rounding."""
 

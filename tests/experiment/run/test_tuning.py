@@ -32,6 +32,7 @@ from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoi
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
+from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts import load_part
@@ -98,9 +99,7 @@ def test_scores_are_calibrated_and_low_on_images_without_objects():
     shown, empty = scored(2, 3000), scored(3, 1000, right=False)
     scores = np.concatenate([score(item.features, weights) for item in (shown, empty)])
     correct = np.concatenate([shown.correct, empty.correct])
-    bins = np.ceil(10 * scores)
-    gaps = [np.abs((scores - correct)[bins == k].sum()) for k in range(11)]
-    assert sum(gaps) / len(scores) < 0.05  # expected calibration error
+    assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
     loud = best_scores(empty, options) >= options["min_score"]
     assert loud.mean() <= 4 * FalsePositiveTarget.false_positive_rate
     assert options["min_score"] < 1
