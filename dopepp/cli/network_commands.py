@@ -129,9 +129,11 @@ def doctor(
     estimator = options.load_estimator(model, device, unit, working_distance, tilt, parts)
     solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
     estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
-    given = distance, crop is not None, shown_at if shown_at or empty else None
+    is_cropped, is_known = crop is not None, bool(centres or empty)
     try:
-        case = Case(estimator, *lens.undistort(pixels), solid_parts, *given)
+        undistorted = lens.undistort(pixels)
+        positions = shown_at if is_known else None
+        case = Case(estimator, *undistorted, solid_parts, distance, is_cropped, positions)
     except UserError as error:
         findings = [Diagnosis("camera", f"{error.got}; allowed: {error.allowed}", error.fix)]
     else:
