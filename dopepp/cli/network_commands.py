@@ -117,9 +117,8 @@ def doctor(
     if centres and empty:
         fix = "leave out --at or --empty"
         raise UserError("--at together with --empty", "only one of them", fix)
-    shown_at = [
-        options.two_numbers("--at", text, "u,v in pixels", "412,230") for text in centres or ()
-    ]
+    words = centres or ()
+    shown_at = [options.two_numbers("--at", word, "u,v in pixels", "412,230") for word in words]
     K = None if intrinsics is None else camera_matrix(*intrinsics)
     lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
     pixels = read_photo(image)
@@ -129,11 +128,10 @@ def doctor(
     estimator = options.load_estimator(model, device, unit, working_distance, tilt, parts)
     solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
     estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
-    is_cropped, is_known = crop is not None, bool(centres or empty)
+    positions = shown_at if centres or empty else None
     try:
         undistorted = lens.undistort(pixels)
-        positions = shown_at if is_known else None
-        case = Case(estimator, *undistorted, solid_parts, distance, is_cropped, positions)
+        case = Case(estimator, *undistorted, solid_parts, distance, crop is not None, positions)
     except UserError as error:
         findings = [Diagnosis("camera", f"{error.got}; allowed: {error.allowed}", error.fix)]
     else:
