@@ -18,7 +18,11 @@ SUFFIXES = (*IMAGES, ".tif", ".tiff")
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the sorted file names of a folder's images, of which there must be at least one."""
+    """Return the sorted file names of a folder's images.
+
+    Raises:
+        UserError: The folder has no images.
+    """
     names = sorted(path.name for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
     if not names:
         allowed = f"a folder with {', '.join(SUFFIXES)}"

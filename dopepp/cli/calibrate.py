@@ -258,7 +258,8 @@ def rig(
 
 def _pose_format(unit: str, angles: str, quaternion: str, direction: str) -> PoseFormat:
     """Return the conventions of a file of robot poses from the options, after checking them."""
-    from dopepp.robot.calibration.records import UNITS, PoseFormat
+    from dopepp.parts.part import UNITS
+    from dopepp.robot.calibration.records import PoseFormat
 
     check_choice("--unit", unit, UNITS)
     check_choice("--angles", angles, ("rad", "deg"))

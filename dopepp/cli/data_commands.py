@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperCommand
 
-from dopepp.cli.common import Unit
+from dopepp.cli import options
 from dopepp.core.errors import interruptible
 
 
@@ -40,7 +40,7 @@ def render(
     parts: Annotated[list[str], Argument(help="Mesh files, built-in parts, or NAME=FILE.")],
     out: Annotated[Path, Option(help="Folder of the data set.")],
     num: Annotated[int | None, Option("-n", help="Number of images.")] = None,
-    unit: Unit = None,
+    unit: options.Unit = None,
     layout: Annotated[str, Option("--format", help="bop, ndds or webdataset.")] = "bop",
     preset: Annotated[str, Option(help="Kind of scene.")] = "paper",
     size: Annotated[
@@ -146,7 +146,7 @@ def download(
 
 def symmetries(
     part: Annotated[str, Argument(help="Mesh file or built-in part.")],
-    unit: Unit = None,
+    unit: options.Unit = None,
     tolerance: Annotated[
         float, Option(help="Largest surface deviation, as a share of the diameter.")
     ] = 0.01,

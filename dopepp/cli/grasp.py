@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import Unit
+from dopepp.cli import options
 from dopepp.core.errors import require
 
 NETWORKS: Final = {
@@ -28,7 +28,7 @@ app = typer.Typer(
 def grasp(
     context: typer.Context,
     part: Annotated[str, Option(help="Built-in part or mesh file.")] = "pivconnector",
-    unit: Unit = None,
+    unit: options.Unit = None,
     count: Annotated[int, Option("-n", help="Number of grasps, or of heaps.")] = 200,
     network: Annotated[
         str | None, Option(help="Checkpoint (default: the built-in part's release).")
@@ -76,7 +76,7 @@ def grasp(
 def propose(
     part: Annotated[str, Argument(help="Built-in part or mesh file.")],
     out: Annotated[Path, Option(help="YAML file to write.")],
-    unit: Unit = None,
+    unit: options.Unit = None,
     count: Annotated[int, Option("-n", min=1, max=1000, help="Number of grasps.")] = 24,
     seed: Annotated[int, Option(min=0, help="Random seed.")] = 0,
 ) -> None:

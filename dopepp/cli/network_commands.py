@@ -11,25 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import (
-    MODEL_HELP,
-    CameraFile,
-    Conf,
-    Crop,
-    Device,
-    Distances,
-    Intrinsics,
-    KSize,
-    Meshes,
-    Model,
-    Region,
-    Tilt,
-    Unit,
-    WorkingDistance,
-    check_region,
-    load_estimator,
-    two_numbers,
-)
+from dopepp.cli import options
 from dopepp.core.errors import Interruption, UserError, interruptible, require
 
 if TYPE_CHECKING:
@@ -42,13 +24,13 @@ SIZE: Final = (640, 480)  # width and height of rendered images
 def benchmark(
     models: Annotated[list[Path], Argument(help="Checkpoints, exported files and meshes.")],
     image: Annotated[Path | None, Option(help="Image (default: renders).")] = None,
-    intrinsics: Intrinsics = None,
-    refine: Region = None,
+    intrinsics: options.Intrinsics = None,
+    refine: options.Region = None,
     frames: Annotated[int, Option("-n", min=1, max=100_000, help="Frames.")] = 50,
-    unit: Unit = None,
-    working_distance: WorkingDistance = None,
-    tilt: Tilt = None,
-    device: Device = "cpu",
+    unit: options.Unit = None,
+    working_distance: options.WorkingDistance = None,
+    tilt: options.Tilt = None,
+    device: options.Device = "cpu",
 ) -> None:
     """Time the steps from an image to its poses, in milliseconds per frame."""
     from dopepp.core.pool import num_threads
@@ -63,7 +45,7 @@ def benchmark(
         raise UserError("only one of --image and --K", "both or neither", fix)
     rows = []
     for path in models:
-        estimator = load_estimator(path, device, unit, working_distance, tilt)
+        estimator = options.load_estimator(path, device, unit, working_distance, tilt)
         if image is not None and intrinsics is not None:
             images = [(read_photo(image), camera_matrix(*intrinsics))]
         elif not estimator.has_network:
@@ -103,23 +85,23 @@ def _row(path: Path, timing: Timing) -> dict[str, str]:
 
 def doctor(
     image: Annotated[Path, Argument(help="Image (PNG, JPEG or TIFF).")],
-    model: Annotated[Path, Option(help=MODEL_HELP)],
-    intrinsics: Intrinsics = None,
-    camera: CameraFile = None,
-    K_size: KSize = None,
-    crop: Crop = None,
-    distance: Distances = None,
-    refine: Region = None,
-    parts: Meshes = None,
-    unit: Unit = None,
-    working_distance: WorkingDistance = None,
-    tilt: Tilt = None,
+    model: Annotated[Path, Option(help=options.MODEL_HELP)],
+    intrinsics: options.Intrinsics = None,
+    camera: options.CameraFile = None,
+    K_size: options.KSize = None,
+    crop: options.Crop = None,
+    distance: options.Distances = None,
+    refine: options.Region = None,
+    parts: options.Meshes = None,
+    unit: options.Unit = None,
+    working_distance: options.WorkingDistance = None,
+    tilt: options.Tilt = None,
     centres: Annotated[
         list[str] | None,
         Option("--at", help="u,v: pixel of a part's centre; repeat for every part in the image."),
     ] = None,
     empty: Annotated[bool, Option("--empty", help="The image shows none of the parts.")] = False,
-    device: Device = "cpu",
+    device: options.Device = "cpu",
 ) -> None:
     """Diagnose an image, its camera and its part, one finding with its remedy per line.
 
@@ -131,23 +113,25 @@ def doctor(
     from dopepp.inference.frames.media import Images
     from dopepp.inference.frames.source import Lens, choose_camera
 
-    check_region(refine)
+    options.check_region(refine)
     if centres and empty:
         fix = "leave out --at or --empty"
         raise UserError("--at together with --empty", "only one of them", fix)
-    shown_at = [two_numbers("--at", text, "u,v in pixels", "412,230") for text in centres or ()]
+    words = centres or ()
+    shown_at = [options.two_numbers("--at", word, "u,v in pixels", "412,230") for word in words]
     K = None if intrinsics is None else camera_matrix(*intrinsics)
     lens = Lens(choose_camera(K, camera, Images([image])), K_size, crop)
     pixels = read_photo(image)
     from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
     from dopepp.parts.catalogue import with_meshes
 
-    estimator = load_estimator(model, device, unit, working_distance, tilt, parts)
+    estimator = options.load_estimator(model, device, unit, working_distance, tilt, parts)
     solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
     estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
-    given = distance, crop is not None, shown_at if shown_at or empty else None
+    positions = shown_at if centres or empty else None
     try:
-        case = Case(estimator, *lens.undistort(pixels), solid_parts, *given)
+        undistorted = lens.undistort(pixels)
+        case = Case(estimator, *undistorted, solid_parts, distance, crop is not None, positions)
     except UserError as error:
         findings = [Diagnosis("camera", f"{error.got}; allowed: {error.allowed}", error.fix)]
     else:
@@ -160,16 +144,16 @@ def doctor(
 
 
 def serve(
-    model: Model,
+    model: options.Model,
     port: Annotated[
         int | None, Option(min=1, max=65535, help="Port (default: first free from 7860).")
     ] = None,
-    conf: Conf = None,
-    refine: Region = None,
-    unit: Unit = None,
-    working_distance: WorkingDistance = None,
-    tilt: Tilt = None,
-    device: Device = "cpu",
+    conf: options.Conf = None,
+    refine: options.Region = None,
+    unit: options.Unit = None,
+    working_distance: options.WorkingDistance = None,
+    tilt: options.Tilt = None,
+    device: options.Device = "cpu",
 ) -> None:
     """Open a local web page that estimates poses on uploaded images.
 
@@ -178,10 +162,10 @@ def serve(
     # Gradio polls its own server, which httpx would log.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     require("gradio", "dopepp serve", "web")
-    check_region(refine)
+    options.check_region(refine)
     from dopepp.inference.page import serve_page
 
-    estimator = load_estimator(model, device, unit, working_distance, tilt)
+    estimator = options.load_estimator(model, device, unit, working_distance, tilt)
     estimator = estimator if refine is None else estimator.refining(refine)
     estimator = estimator.reporting(conf)
     with suppress(Interruption), interruptible(""), serve_page(estimator, port) as address:

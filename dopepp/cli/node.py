@@ -9,21 +9,7 @@ from typing import Annotated, Final
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import (
-    Conf,
-    Device,
-    Intrinsics,
-    MaxMs,
-    Model,
-    Region,
-    ScaleError,
-    Tilt,
-    Track,
-    Unit,
-    WorkingDistance,
-    check_region,
-    load_estimator,
-)
+from dopepp.cli import options
 from dopepp.core.errors import UserError, interruptible, require
 from dopepp.core.validation import Range, check
 
@@ -32,7 +18,7 @@ TOPIC: Final = "/camera/image_raw"
 
 
 def node(
-    model: Model,
+    model: options.Model,
     source: Annotated[
         list[str] | None, Argument(help="With --json or --udp: sources as in `dopepp predict`.")
     ] = None,
@@ -61,21 +47,21 @@ def node(
     ] = None,
     name: Annotated[str, Option(help="Name of the node and prefix of its topics.")] = "dope",
     params: Annotated[Path | None, Option(help="With --ros2: YAML of parameters.")] = None,
-    intrinsics: Intrinsics = None,
+    intrinsics: options.Intrinsics = None,
     camera: Annotated[Path | None, Option(help="Camera file, for camera_info.")] = None,
     frame: Annotated[
         str | None, Option(help="Optical frame of the camera (default: the images' frame).")
     ] = None,
-    conf: Conf = None,
-    refine: Region = None,
-    max_ms: MaxMs = None,
-    scale_error: ScaleError = None,
-    track: Track = False,
+    conf: options.Conf = None,
+    refine: options.Region = None,
+    max_ms: options.MaxMs = None,
+    scale_error: options.ScaleError = None,
+    track: options.Track = False,
     overlay: Annotated[bool, Option("--overlay", help="Publish drawn poses.")] = False,
-    unit: Unit = None,
-    working_distance: WorkingDistance = None,
-    tilt: Tilt = None,
-    device: Device = "cpu",
+    unit: options.Unit = None,
+    working_distance: options.WorkingDistance = None,
+    tilt: options.Tilt = None,
+    device: options.Device = "cpu",
 ) -> None:
     """Publish the poses in every image of a camera, until Ctrl-C.
 
@@ -91,7 +77,7 @@ def node(
         for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
         _check_topics(topics, transport, for_one if len(topics) > 1 else for_several)
         lag = None if lag is None else check("--lag", lag, float, Range(0, 10))
-        check_region(refine)
+        options.check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames.source import choose_camera, given_camera
@@ -106,7 +92,7 @@ def node(
 
         sources = open_sources(words, topics[0] if topic else None) if transport in LINES else []
         cameras = [fixed_camera or choose_camera(None, None, opened) for opened in sources]
-        estimator = load_estimator(
+        estimator = options.load_estimator(
             model, device, unit, working_distance, tilt, max_ms=max_ms, scale_error=scale_error
         )
         if track or refine or len(topics) > 1:

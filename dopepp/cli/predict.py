@@ -13,24 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from dopepp.cli.common import (
-    CameraFile,
-    Conf,
-    Crop,
-    Device,
-    Distances,
-    Intrinsics,
-    KSize,
-    MaxMs,
-    Meshes,
-    Model,
-    ScaleError,
-    Tilt,
-    Track,
-    Unit,
-    WorkingDistance,
-    load_estimator,
-)
+from dopepp.cli import options
 from dopepp.core.errors import UserError, interruptible
 
 if TYPE_CHECKING:
@@ -47,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def predict(
-    model: Model,
+    model: options.Model,
     source: Annotated[
         list[str],
         Argument(
@@ -55,23 +38,23 @@ def predict(
             "a camera number, or an rtsp:// or http:// stream."
         ),
     ],
-    intrinsics: Intrinsics = None,
-    camera: CameraFile = None,
-    K_size: KSize = None,
-    crop: Crop = None,
+    intrinsics: options.Intrinsics = None,
+    camera: options.CameraFile = None,
+    K_size: options.KSize = None,
+    crop: options.Crop = None,
     topic: Annotated[str | None, Option(help="Image topic of a ROS bag with several.")] = None,
-    distance: Distances = None,
+    distance: options.Distances = None,
     roi: Annotated[
         tuple[int, int, int, int] | None, Option(help="Region of interest: x y width height.")
     ] = None,
-    conf: Conf = None,
+    conf: options.Conf = None,
     stride: Annotated[int, Option(help="Use every n-th frame only.")] = 1,
-    track: Track = False,
+    track: options.Track = False,
     refine: Annotated[
         str | None, Option(help="region, depth (with --depth), or region,depth.")
     ] = None,
-    max_ms: MaxMs = None,
-    scale_error: ScaleError = None,
+    max_ms: options.MaxMs = None,
+    scale_error: options.ScaleError = None,
     depth: Annotated[
         Path | None, Option(help="Depth aligned with the image: 16-bit PNG, 0 = unknown.")
     ] = None,
@@ -86,11 +69,11 @@ def predict(
     verify: Annotated[
         bool, Option("--verify", help="Compare rendered parts with the image.")
     ] = False,
-    parts: Meshes = None,
-    unit: Unit = None,
-    working_distance: WorkingDistance = None,
-    tilt: Tilt = None,
-    device: Device = "cpu",
+    parts: options.Meshes = None,
+    unit: options.Unit = None,
+    working_distance: options.WorkingDistance = None,
+    tilt: options.Tilt = None,
+    device: options.Device = "cpu",
     save: Annotated[Path | None, Option(help="Folder for drawn images and videos.")] = None,
     json_file: Annotated[Path | None, Option("--json", help="File with a line per image.")] = None,
     csv: Annotated[Path | None, Option(help="Poses in the format of the BOP challenge.")] = None,
@@ -139,7 +122,7 @@ def predict(
 
         from dopepp.parts.catalogue import with_meshes
 
-        estimator = load_estimator(
+        estimator = options.load_estimator(
             model, device, unit, working_distance, tilt, parts, max_ms, scale_error
         ).reporting(conf)
         known_parts = estimator.parts
@@ -161,7 +144,7 @@ def predict(
             recordings = [rerun] * (rerun is not None) + [None] * show
             outputs += [(path or Path("viewer"), Viewer(estimator, path)) for path in recordings]
         verification = _verification(known_parts) if verify else None
-        options: StreamOptions = {
+        stream_options: StreamOptions = {
             "stride": stride,
             "track": track,
             "distances": distance,
@@ -174,7 +157,9 @@ def predict(
         with Outputs(outputs) as written:
             for opened, its_camera in zip(sources, cameras, strict=True):
                 written.begin(opened)
-                _predict_source(estimator, opened, its_camera, options, verification, written)
+                _predict_source(
+                    estimator, opened, its_camera, stream_options, verification, written
+                )
 
 
 def _exclude(option: str, others: dict[str, object]) -> None:

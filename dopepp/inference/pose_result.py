@@ -137,7 +137,11 @@ class PoseResult:
         return canvas
 
     def save(self, path: Path | str) -> None:
-        """Write :meth:`plot` as PNG or JPEG, according to the suffix, or raise a ``UserError``."""
+        """Write :meth:`plot` as PNG or JPEG, according to the suffix.
+
+        Raises:
+            UserError: The suffix is neither PNG's nor JPEG's, or the file cannot be written.
+        """
         check_target(Path(path), IMAGES)
         write_image(Path(path), self.plot())
 

@@ -39,7 +39,6 @@ def folder(rendered, tmp_path_factory):
     written = {
         "whole.png": image,
         "deep.png": 257 * image.astype(np.uint16),
-        "raw.png": 16 * image.astype(np.uint16),
         "lens.png": cv2.remap(image, straight.astype(np.float32), None, cv2.INTER_LINEAR),
         "half.png": cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA),
         "cut.png": image[:400, 8:],
@@ -108,15 +107,10 @@ def test_the_distortion_of_the_lens_is_corrected(poses, folder, rendered, tmp_pa
         ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
         ("whole.png", ["--camera", "whole.png"], "camera file"),
         ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
-        ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the image was resized"),
         ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cropped"),
-        ("4k.png", ["--camera", "plain.json"], "calibrate the camera at 3840×2160"),
         ("4k.png", ["--camera", "K.txt"], "likely of 640×480"),
-        ("whole.png", ["--K", "100", "100", "63.5", "63.5"], "likely of 128×128"),
-        ("whole.png", ["--K", "nan", "100", "319.5", "239.5"], "3×3 pinhole"),
         ("whole.png", ["--K", "0.1", "0.1", "319.5", "239.5"], "field of view of 5° – 150°"),
         ("anim.gif", ["--camera", "K.txt"], "magick anim.gif image.png"),
-        ("raw.png", ["--camera", "K.txt"], "magick raw.png -auto-level"),
         ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
         pytest.param(
             "whole.png",

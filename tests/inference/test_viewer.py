@@ -52,20 +52,14 @@ def test_beliefs_peak_where_the_part_is(estimator, result):
     assert nearest < 2 * scale.max()
 
 
-def test_wrong_suffix_is_rejected(estimator, tmp_path):
+def test_errors_name_the_suffix_the_extra_and_the_file_option(estimator, tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"\.rrd"):
         Viewer(estimator, tmp_path / "out.mp4")
-
-
-def test_missing_extra_is_reported(estimator, tmp_path, monkeypatch):
-    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda _: None)
-    with pytest.raises(UserError, match=r"dopepp\[rerun\]"):
-        Viewer(estimator, tmp_path / "out.rrd")
-
-
-def test_error_without_a_display_names_the_file_option(estimator, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(UserError, match=r"--rerun FILE\.rrd"):
         Viewer(estimator)
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"dopepp\[rerun\]"):
+        Viewer(estimator, tmp_path / "out.rrd")

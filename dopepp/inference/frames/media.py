@@ -56,7 +56,11 @@ class Images(FrameSource):
         self._numbers = numbers if are_unique else range(len(paths))
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th image; raise a ``UserError`` if an image is damaged."""
+        """Yield every ``stride``-th image.
+
+        Raises:
+            UserError: An image is damaged.
+        """
         for number, path in list(zip(self._numbers, self._paths, strict=True))[::stride]:
             yield CameraFrame(read_photo(path), str(path), number)
 
@@ -236,7 +240,11 @@ class _NewestFrame:
 
 
 def is_url(text: str) -> bool:
-    """Return whether a text is the URL of a stream; reject schemes other than SCHEMES."""
+    """Return whether a text is the URL of a stream.
+
+    Raises:
+        UserError: The URL has another scheme than :data:`SCHEMES`.
+    """
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]*)://", text)
     if scheme is None:
         return False

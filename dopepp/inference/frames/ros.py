@@ -145,7 +145,11 @@ class Bag(FrameSource):
         self.rate = max(1.0, (self.count - 1) / seconds) if seconds > 0 else 1.0
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
-        """Yield every ``stride``-th image; raise a ``UserError`` if an image is damaged."""
+        """Yield every ``stride``-th image.
+
+        Raises:
+            UserError: An image is damaged.
+        """
         for number, (seconds, message) in enumerate(self._messages([self.topic], RAW, COMPRESSED)):
             if number % stride:
                 continue

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector, nearest_rotation
+from dopepp.parts.part import UNITS
 from dopepp.robot.calibration.board import BoardPose, Transforms
 from dopepp.robot.calibration.hand_eye import (
     MOUNTS,
@@ -25,7 +26,7 @@ from dopepp.robot.calibration.hand_eye import (
     relative_motions,
     robot_world_equations,
 )
-from dopepp.robot.calibration.records import UNITS, PoseFormat, RobotPoses
+from dopepp.robot.calibration.records import PoseFormat, RobotPoses
 from dopepp.robot.calibration.tool import axis_name
 
 MIN_ROTATION: Final = np.radians(5.0)  # smallest valid maximum of the rotations between two poses

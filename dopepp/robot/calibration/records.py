@@ -237,7 +237,11 @@ def write_calibration(
 
 
 def check_trust(findings: Sequence[str], force: bool) -> None:
-    """Reject a calibration that has findings, unless ``force`` is true."""
+    """Reject a calibration that has findings, i.e. reasons not to trust it.
+
+    Raises:
+        UserError: There are findings, and ``force`` is false.
+    """
     if findings and not force:
         problem = f"a calibration that is not trustworthy: {'; '.join(findings)}"
         fix = "measure again as advised, or add --force to write it anyway"

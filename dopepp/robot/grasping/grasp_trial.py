@@ -398,8 +398,8 @@ class Trials:
         counts: dict[str, Any] = {"attempt": scene.attempt, "parts": len(scene.parts)}
         trial = (scene.number, source.name, source.error[0])
         if estimate is None:
-            nans = [float("nan")] * 3
-            return Record(*trial, False, False, *nans, False, "not seen", *ends, **counts)
+            nan = float("nan")
+            return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends, **counts)
         adds = [self._add(estimate, target) for target in scene.targets]
         add, target = min(adds), scene.targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))

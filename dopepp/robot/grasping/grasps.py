@@ -123,7 +123,11 @@ class _GraspFile:
 
 
 def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
-    """Read a YAML file of grasps; raise a ``UserError`` if it is invalid or of another part."""
+    """Read a YAML file of grasps.
+
+    Raises:
+        UserError: The file is invalid, or of another part.
+    """
     content = parse(_GraspFile, read_yaml(path), str(path), FIX)
     if content.part != part.name:
         raise UserError(f"{path}, part: {content.part!r:.100}", f"part: {part.name}", FIX)

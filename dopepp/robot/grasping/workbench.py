@@ -257,7 +257,11 @@ def has_gl() -> bool:
 
 
 def open_gl(model: Any, size: tuple[int, int]) -> Any:
-    """Return a MuJoCo renderer, or raise a ``UserError`` if OpenGL is not available."""
+    """Return a MuJoCo renderer for images of ``size``, (width, height) in pixels.
+
+    Raises:
+        UserError: OpenGL is not available.
+    """
     try:
         return mujoco.Renderer(model, size[1], size[0])
     except Exception as error:  # drivers raise many types

@@ -66,10 +66,9 @@ class ViewsWorker(Worker):
             return None
         self._check_time(views[0].stamp, shots[0].topic)
         estimator = self._estimator(True).reporting(self.settings.confidence)
-        estimate = estimator.predict_views
-        if self._views_tracker is not None:
-            self._views_tracker.estimator = estimator
-            estimate = self._views_tracker.track
+        tracker = self._views_tracker
+        if tracker is not None:
+            tracker.estimator = estimator
         try:
             if self.poses is None:
                 T_world_cam = [self.look_up(view.frame_id, view.stamp) for view in views]
@@ -77,6 +76,7 @@ class ViewsWorker(Worker):
                 T_world_cam = [pose.T_world_cam for pose in self.poses]
             images, cameras = [view.frame.image for view in views], [view.camera for view in views]
             names, error = [shot.topic for shot in shots], self._camera_error
+            estimate = estimator.predict_views if tracker is None else tracker.track
             result = estimate(images, cameras, T_world_cam, camera_error=error, names=names)
         except ValueError as problem:
             self._reject("views", str(problem))

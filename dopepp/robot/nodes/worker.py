@@ -277,7 +277,11 @@ class Worker:
 
 
 def check_size(camera: Camera, image: RGBImage) -> None:
-    """Raise a ``UserError`` if a camera was calibrated for another size than an image's."""
+    """Check that a camera was calibrated for the size of an image.
+
+    Raises:
+        UserError: It was calibrated for another size.
+    """
     size = (image.shape[1], image.shape[0])
     if camera.size is not None and camera.size != size:
         sizes = f"{camera.size[0]}×{camera.size[1]}, and images of {size[0]}×{size[1]}"

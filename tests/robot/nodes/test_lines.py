@@ -50,6 +50,7 @@ def test_each_datagram_holds_a_line(run, camera, intrinsics):
         (("{images}", "--json", "--params", "p.yaml"), "--params with --json"),
         (("{images}", "--bag", "a.bag", "--out", "b.mcap"), "--bag with"),
         (("camera", "--ros2"), "--ros2 with"),
+        (("{images}", "--json", "--camera", "none.yaml"), "none.yaml"),
         (("{images}", "--json", "--topic", "/a", "--topic", "/b"), "2 topics with --json"),
         (("{images}", "--json", "--views", "rig.yaml"), "--views with one topic"),
     ],
@@ -57,9 +58,3 @@ def test_each_datagram_holds_a_line(run, camera, intrinsics):
 def test_wrong_combinations_of_options_are_one_line(refused, camera, words, message):
     options = (str(word).format(images=camera.folder) for word in words)
     assert message in refused("node", MODEL, *options)
-
-
-def test_a_missing_model_or_camera_is_one_line(refused, camera, intrinsics, tmp_path):
-    assert "none.ckpt" in refused("node", "none.ckpt", camera.folder, "--json", *intrinsics)
-    options = ("--json", "--camera", tmp_path / "none.yaml")
-    assert "none.yaml" in refused("node", MODEL, camera.folder, *options)

@@ -101,9 +101,9 @@ def load_estimator(
     if working_distance is not None:
         allowed = "NEAR,FAR in metres"
         distances = two_numbers("--working-distance", working_distance, allowed, "0.3,0.5")
-    limits = {"max_ms": max_ms, "scale_error": scale_error}
+    tilt_deg = 180.0 if tilt is None else tilt
     return PoseEstimator.from_mesh(
-        model, unit, distances, 180.0 if tilt is None else tilt, **limits
+        model, unit, distances, tilt_deg, max_ms=max_ms, scale_error=scale_error
     )
 
 
