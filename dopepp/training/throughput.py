@@ -96,8 +96,9 @@ def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
     if isinstance(profiler, SimpleProfiler):  # includes the time of nested hooks
         for name, durations in profiler.recorded_durations.items():
             totals.append((name, len(durations), sum(durations)))
-    elif isinstance(profiler, PyTorchProfiler) and profiler.function_events:
-        for event in profiler.function_events.key_averages():
+    else:
+        events: Any = getattr(profiler, "function_events", None)  # of torch's operators
+        for event in events.key_averages() if events else ():
             seconds = 1e-6 * (event.self_cpu_time_total + event.self_device_time_total)
             totals.append((event.key, event.count, seconds))
     slowest = sorted(totals, key=lambda total: total[2], reverse=True)[:limit]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Final
+from typing import Any, Final
 
 from dopepp.core import extensions
 from dopepp.core.errors import UserError
@@ -147,8 +147,8 @@ def _synthetic_images(
         return None
     if not read_image_set(data.root, image_set, "synthetic"):
         return None
-    chosen = (data.root, parts, image_set, "synthetic")
-    return YcbVideoReader(*chosen, backgrounds=backgrounds, seed=seed, read_depth=False)
+    options: Any = {"backgrounds": backgrounds, "seed": seed, "read_depth": False}
+    return YcbVideoReader(data.root, parts, image_set, "synthetic", **options)
 
 
 def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:

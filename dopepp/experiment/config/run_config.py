@@ -184,19 +184,12 @@ class FalsePositiveTarget:
 
 @dataclass(frozen=True)
 class Protocols:
-    """Measurements in addition to the accuracy on the unmodified test set.
+    """Measurements in addition to the accuracy on the unmodified test set."""
 
-    Attributes:
-        shading: Shares of every object's visible area to cover, ascending, without 0.
-        scales: Factors on the apparent size of the parts, ascending, without 1.
-        by: Quantities by which the pass rates are broken down.
-        num_bins: Number of bins per quantity.
-    """
-
-    shading: tuple[float, ...] = ()
-    scales: tuple[float, ...] = ()
-    by: tuple[QuantityName, ...] = ()
-    num_bins: int = 5
+    shading: tuple[float, ...] = ()  # covered shares of the visible area, ascending, without 0
+    scales: tuple[float, ...] = ()  # factors on the apparent size, ascending, without 1
+    by: tuple[QuantityName, ...] = ()  # quantities by which the pass rates are broken down
+    num_bins: int = 5  # per quantity
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Protocols:

@@ -8,10 +8,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import yaml
 from rich.console import Console, JustifyMethod
 from rich.table import Table
-from rich.text import Text
-from rich.tree import Tree
 
 from dopepp.data.sample import SourceInfo
 from dopepp.experiment.results.frame import FIELDS, header_of
@@ -24,18 +23,9 @@ console = Console(highlight=False, markup=False, width=None if Console().is_term
 
 
 def show_config(config: Mapping[str, Any]) -> None:
-    """Print a nested config as a tree."""
-    tree = Tree(Text("config", style="bold"))
-    _branch(tree, config)
-    console.print(tree)
-
-
-def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            _branch(tree.add(Text(str(key), style="bold")), value)
-        else:
-            tree.add(f"{key}: {value!r}", style="default")
+    """Print a nested config as YAML."""
+    console.print("config", style="bold")
+    console.print(yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
 
 
 def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:

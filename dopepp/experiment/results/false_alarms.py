@@ -112,12 +112,15 @@ def count_false_alarms(
         scores = {sample.key: score for sample, score in loudest}
         rate = num_reported / len(frames)
         alarms[name] = FalseAlarms(len(frames), rate, estimator.min_score, scores)
-        tiles = []
-        for sample, score in loudest:
-            best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
-            wireframe = Wireframe(best.keypoints, YELLOW, f"{best.object} {score:.3g}")
-            tiles.append(Tile(overlay(sample.image, [wireframe]), sample.key))
+        tiles = [_tile(estimator, sample) for sample, _ in loudest]
     return alarms, tiles
+
+
+def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
+    """Draw the candidate with the highest score on an image without the part."""
+    best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
+    wireframe = Wireframe(best.keypoints, YELLOW, f"{best.object} {best.score:.3g}")
+    return Tile(overlay(sample.image, [wireframe]), sample.key)
 
 
 def alarm_rows(report: Report) -> list[Row]:

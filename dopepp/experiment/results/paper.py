@@ -63,25 +63,17 @@ _MEASURED: Final = ("poses", "shading")  # kinds of tables that need trained net
 class PaperTable:
     """Layout of the table of a sweep.
 
-    Attributes:
-        title: Title with the paper's table number.
-        kind: A key of :data:`KINDS`.
-        threshold: Threshold of the paper's pass rate: 0.05 m for parts, 0.1 m for YCB-Video.
-        labels: Label in the paper for each override; several labels are joined.
-        paper: Values that the paper prints, by label, object and measure. A measure is a field of
-            ``PoseRow`` (``pass`` for the paper's pass rate) or a heading. Rates are in percent.
-        recomputed: Values of other methods, measured with the functions of this project.
-        notes: Notes below the table.
+    A printed measure is a field of ``PoseRow`` (``pass`` for the paper's pass rate) or a heading.
     """
 
     __pydantic_config__ = STRICT
-    title: str
-    kind: Literal["poses", "shading", "parameters", "time"] = "poses"
-    threshold: float = 0.05
-    labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    paper: Printed = dataclasses.field(default_factory=dict)
-    recomputed: Printed = dataclasses.field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    title: str  # with the paper's table number
+    kind: Literal["poses", "shading", "parameters", "time"] = "poses"  # a key of `KINDS`
+    threshold: float = 0.05  # of the paper's pass rate, metres; 0.1 for YCB-Video
+    labels: Mapping[str, str] = dataclasses.field(default_factory=dict)  # by override; joined
+    paper: Printed = dataclasses.field(default_factory=dict)  # values, rates in percent
+    recomputed: Printed = dataclasses.field(default_factory=dict)  # with functions of this project
+    notes: tuple[str, ...] = ()  # below the table
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> PaperTable:

@@ -92,8 +92,8 @@ def _short_training(config: RunConfig) -> RunConfig:
         "val_check_interval": None,
         "enable_checkpointing": False,
     }
-    one = {"devices": 1, "num_nodes": 1, "strategy": "auto", "lightning": lightning}
-    trainer = replace(config.trainer, max_steps=-1, max_epochs=_MOST, **one)
+    trainer = replace(config.trainer, devices=1, num_nodes=1, strategy="auto", lightning=lightning)
+    trainer = replace(trainer, max_steps=-1, max_epochs=_MOST)
     return replace(config, trainer=trainer, scheduler={}, callbacks={}, ema=None)
 
 
