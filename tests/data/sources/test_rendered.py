@@ -143,7 +143,7 @@ def test_samples_that_do_not_fit_are_rejected(fake_source, monkeypatch):
         with pytest.raises(ValueError, match="one size and source"):
             cached.sample(1)
     monkeypatch.setattr(rendered, "_MAX_INSTANCES", 0)
-    with pytest.raises(ValueError, match="1 instances, .*; at most 0 instances"):
+    with pytest.raises(ValueError, match=r"1 instances, .*; at most 0 instances"):
         CachedSource(fake_source(), (64, 64))
 
 
