@@ -95,15 +95,14 @@ def make_job(
     working_distance: str | None = None,
     views: int = 1,
 ) -> RenderJob:
-    """Make a job from user input.
+    """Make a job from user input; the arguments are the options of ``dopepp render``.
 
     Args:
         parts: Built-in names, mesh files, or ``NAME=FILE`` to name a file's part.
         unit: Unit of the mesh files; None for the unit of the format, otherwise millimetres.
         preset: Name of a preset, which defines the random scenes.
         changes: Changed fields of the preset as ``field.field=value``, the value in YAML.
-        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels for :meth:`Preset.reframed`; None
-            for the preset's size.
+        size: ``WIDTHxHEIGHT`` in pixels for :meth:`Preset.reframed`; None for the preset's size.
         seed: Seed of all random choices of the job.
         backgrounds: Value for :func:`~dopepp.virtual.backgrounds.find_backgrounds`.
         negatives: Parts to show as distractors without labels, written like ``parts``.
@@ -112,9 +111,6 @@ def make_job(
         camera: File of the camera to simulate; None for the preset's camera.
         working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
         views: Number of cameras of each scene. More than 1 gives a folder per scene; BOP only.
-
-    Raises:
-        UserError: An argument is invalid, or a file is missing or invalid.
     """
     _find_writer(layout)
     check("--views", views, int, Range(1, MAX_VIEWS))
@@ -243,9 +239,7 @@ def is_claimed(root: Path) -> bool:
 
 
 def claim(root: Path, record: Mapping[str, Any]) -> None:
-    """Reserve a folder for a job by its record, and remove the files of interrupted writes.
-
-    A folder with an equal record is accepted.
+    """Reserve a folder by a job's record, unless reserved, and remove files of interrupted writes.
 
     Raises:
         UserError: The folder is not writable, or holds another job or other files.

@@ -129,8 +129,7 @@ class CachedSource(WrappedSource):
         input_size: (width, height) that bounds the resized images, which lose their depth; None
             keeps size and depth.
         folder: Folder of the files, in subfolders named by a hash of everything that determines the
-            items; None keeps the items in memory.
-        identity: Version of the code, or other text that determines the items besides the source.
+            items (besides the source, ``identity``); None keeps the items in memory.
 
     Raises:
         UserError: The cache needs more than half of the machine's memory, or the disk is full.

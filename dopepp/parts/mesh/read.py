@@ -46,13 +46,9 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, and convert it to metres.
 
     Duplicate STL vertices are merged, zero-area triangles dropped, and the others oriented
-    consistently. Surfaces may have holes, and triangles may intersect each other. OBJ, PLY and GLB
-    files may have a texture, PLY files also colours and normals.
-
-    Args:
-        path: Mesh file, whose suffix states the format; a texture must lie in its folder.
-        unit: mm, cm, m or inch (default: as stated by a 3MF file, metres for GLB, and otherwise
-            millimetres, with a warning).
+    consistently. Surfaces may have holes, and triangles may intersect each other. The unit is mm,
+    cm, m or inch (default: as stated by a 3MF file, metres for GLB, and otherwise millimetres, with
+    a warning). A texture must lie in the mesh's folder.
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
