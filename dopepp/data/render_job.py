@@ -15,7 +15,6 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,6 +26,9 @@ from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, check
 from dopepp.data.formats import RECORD_FILE, Writer
+from dopepp.data.formats.bop.bop_writer import BopWriter
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
+from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.geometry.camera import invert_transform
@@ -40,12 +42,11 @@ from dopepp.virtual.presets.view import View, read_lens
 
 _log = logging.getLogger(__name__)
 
-WRITERS: Final = {
-    "bop": ("dopepp.data.formats.bop.bop_writer", "BopWriter"),
-    "ndds": ("dopepp.data.formats.ndds.ndds_writer", "NddsWriter"),
-    "webdataset": ("dopepp.data.formats.webdataset.webdataset_writer", "WebdatasetWriter"),
+WRITERS: Final[dict[str, Callable[[Path, Sequence[Part]], Writer]]] = {
+    "bop": BopWriter,
+    "ndds": NddsWriter,
+    "webdataset": WebdatasetWriter,
 }
-"""Module and class of each layout's writer."""
 
 MAX_VIEWS: Final = 16
 RECORD_VERSION: Final = 1  # version of the record's layout
@@ -64,7 +65,7 @@ class RenderJob:
 
     def writer(self, root: Path) -> Writer:
         """Return a writer in the job's layout to the data set in folder ``root``."""
-        writer = _find_writer(self.layout)(root, self.factory.parts)
+        writer = WRITERS[self.layout](root, self.factory.parts)
         if self.views > 1:
             writer.chunk_size = self.views  # a folder for each static scene
         return writer
@@ -112,7 +113,7 @@ def make_job(
         working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
         views: Number of cameras of each scene. More than 1 gives a folder per scene; BOP only.
     """
-    _find_writer(layout)
+    check_choice("--format", layout, WRITERS)
     check("--views", views, int, Range(1, MAX_VIEWS))
     if views > 1 and layout != "bop":
         problem = f"--views {views} with --format {layout}"
@@ -151,13 +152,6 @@ def make_job(
     if views > 1:
         record["views"] = views
     return RenderJob(factory, layout, views, record)
-
-
-def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    check_choice("--format", layout, WRITERS)
-    module, name = WRITERS[layout]
-    writer: Callable[[Path, Sequence[Part]], Writer] = getattr(import_module(module), name)
-    return writer
 
 
 def named_part(text: str, unit: str | None) -> Part:
