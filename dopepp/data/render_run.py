@@ -89,7 +89,7 @@ def run(
     if num is None:
         raise UserError("no number of images", "-n NUMBER, or --preview", "add e.g. -n 1000")
     part, workers = Shard.parse(shard), available_cores() if workers is None else workers
-    check("--workers", workers, int, Range(1, MAX_WORKERS))
+    num_workers = check("--workers", workers, int, Range(1, MAX_WORKERS))
     check_choice("--engine", engine, ENGINES)
     if engine != "ray" and ray_address is not None:
         problem = f"--ray-address {ray_address} with --engine {engine}"
@@ -97,8 +97,8 @@ def run(
 
     def open_pool(content: bytes) -> Pool:
         if engine == "ray":
-            return ClusterPool(content, ray_address, workers)
-        return ProcessPool(content, workers)
+            return ClusterPool(content, ray_address, num_workers)
+        return ProcessPool(content, num_workers)
 
     with ProgressDisplay(Console(stderr=True)) as progress:
         return render_dataset(job, out, num, open_pool, part, progress)
