@@ -57,10 +57,11 @@ class BopFolder(ABC):
     """
 
     chunk_size = 1000  # images in a scene, as in the rendered training sets of BOP
+    split = "train_pbr"
     suffix: str
 
-    def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
-        self.root, self.split, self._parts = Path(root), split, tuple(parts)
+    def __init__(self, root: str | Path, parts: Sequence[Part]) -> None:
+        self.root, self._parts = Path(root), tuple(parts)
 
     @abstractmethod
     def staging(self, chunk: int) -> Path:
