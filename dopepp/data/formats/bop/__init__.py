@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -169,12 +169,10 @@ def is_number(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
-class SceneRecords(NamedTuple):
-    """Records of a scene's JSON files by image; ``infos`` has an entry for each truth, or None."""
-
-    cameras: Mapping[int, object]
-    truths: Mapping[int, list[Record]]
-    infos: Mapping[int, list[Record | None]]
+SceneRecords = tuple[
+    Mapping[int, object], Mapping[int, list[Record]], Mapping[int, list[Record | None]]
+]
+"""Cameras, truths and infos by image; the infos have an entry for each truth, or None."""
 
 
 def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
@@ -189,7 +187,7 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - objects}
     for image, records in objects.items():
         paired[image] = pair_infos(records, infos.get(image), gt_info[f"{image}"])
-    return SceneRecords(cameras, objects, paired)
+    return cameras, objects, paired
 
 
 def _by_image(node: Node) -> dict[int, Any]:
