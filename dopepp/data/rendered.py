@@ -257,9 +257,13 @@ class CachedSource(WrappedSource):
 
 def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
     """Return the dtype of a slot: one sample with an image of ``shape``."""
-    instance = [("T_cam_obj", "f8", (4, 4)), ("keypoints", "f8", (9, 2))]
+    instance: list[tuple[Any, ...]] = [("T_cam_obj", "f8", (4, 4)), ("keypoints", "f8", (9, 2))]
     instance += [("visible_fraction", "f8"), ("has_mask", "?"), ("label", f"U{_TEXT_LENGTH}")]
-    fields = [("image", "u1", (*shape, 3)), ("labels", "u1", shape), ("K", "f8", (3, 3))]
+    fields: list[tuple[Any, ...]] = [
+        ("image", "u1", (*shape, 3)),
+        ("labels", "u1", shape),
+        ("K", "f8", (3, 3)),
+    ]
     fields += [("key", f"U{_TEXT_LENGTH}"), ("num_instances", "i4")]
     fields += [("instances", instance, (_MAX_INSTANCES,))]
     return np.dtype(fields + ([("depth", "f4", shape)] if has_depth else []))

@@ -236,7 +236,8 @@ def misoriented_faces(
         if _signed_volumes(vertices, flip_faces(faces, inverted)).sum() < 0:
             inverted = ~inverted
         oriented = flip_faces(faces, inverted)
-        count, bodies = connected(*topology.neighbours.T, len(faces))
+        first_face, second_face = topology.neighbours.T
+        count, bodies = connected(first_face, second_face, len(faces))
         volumes = np.bincount(bodies, _signed_volumes(vertices, oriented), minlength=count)
         corner_bodies = np.repeat(bodies, 3)
         boxes = _bounding_boxes(vertices[oriented].reshape(-1, 3), corner_bodies, count)

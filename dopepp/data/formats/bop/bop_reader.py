@@ -193,9 +193,10 @@ class BopReader:
             for instance in sorted(instances, key=lambda instance: -instance.visible_fraction):
                 instance.wanted = remaining[instance.label] > 0
                 remaining[instance.label] -= 1
-        depth, path = None, item.depth_file
-        if self._read_depth and path is not None:
-            depth = decode_depth(read_content(path), str(path), item.depth_scale, shape)
+        depth, depth_file = None, item.depth_file
+        if self._read_depth and depth_file is not None:
+            content = read_content(depth_file)
+            depth = decode_depth(content, str(depth_file), item.depth_scale, shape)
         key = f"{item.scene.name}/{item.number:06d}"
         return Sample(image, K, instances, depth, self.name, key)
 
