@@ -22,7 +22,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
@@ -66,7 +66,7 @@ def physical_cores() -> int:
     return len(siblings)
 
 
-def _cores() -> Iterable[int]:
+def _cores() -> Collection[int]:
     if hasattr(os, "sched_getaffinity"):
         return os.sched_getaffinity(0)
     return range(os.cpu_count() or 1)
@@ -168,16 +168,12 @@ class _Worker(threading.local):
 
 
 class ProcessPool(Pool):
-    """Pool of processes on this machine.
+    """Pool of at most ``num_workers`` processes, started on demand and restarted if lost.
 
     Processes are spawned (in about a second), because Mitsuba's thread pool does not survive a
-    fork. Processes finish their item when the pipe is closed, so no file is half-written if
-    the pool is stopped or this process is killed.
-
-    Args:
-        content: Pickled function of one item.
-        num_workers: Maximum number of processes, which are started on demand and restarted if lost.
-        environment: Environment variables of the processes (default: one thread per library).
+    fork. They finish their item when the pipe is closed, so no file is half-written if the pool is
+    stopped or this process is killed. ``environment`` has variables of the processes (default: one
+    thread per library).
     """
 
     batch_size = 2
@@ -290,8 +286,7 @@ class ClusterPool(Pool):
         content: Pickled function of one item.
         address: ``host:port`` of the cluster (default: start one on this machine for the pool).
         num_workers: Number of CPU cores of a cluster that is started on this machine.
-        asked_by: The option that needs Ray, for error messages.
-        option: The option that sets the address, for error messages.
+        asked_by: The option that needs Ray, for error messages, like ``option`` for the address.
         task_options: Options of ``ray.remote`` for a task, e.g. ``num_gpus`` (default: one core).
     """
 

@@ -61,7 +61,7 @@ class Range:
     unit: str = ""
 
     def allowed(self, kind: Any) -> str:
-        """Return the allowed values in words; ``kind`` is the annotated type."""
+        """Return the allowed values of type ``kind`` in words."""
         length = len(typing.get_args(kind))
         is_integer = int in (kind, *typing.get_args(kind))
         form = ".0f" if is_integer else "g"

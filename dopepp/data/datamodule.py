@@ -264,12 +264,15 @@ class PoseLoader(DataLoader[Any]):
         self._epoch_sampler.skip = self._num_batches * self.batch_size
         for batch in super().__iter__():
             if isinstance(batch, UserError):  # a worker returns its error in place of a batch
-                # This ends the workers cleanly. Otherwise the exception's traceback keeps them in a
-                # reference cycle, and the collector closes their queues before they have ended.
-                self._iterator = None
-                raise batch
+                break
             self._num_batches += 1
             yield batch
+        else:
+            return
+        # This ends the workers cleanly. Otherwise the exception's traceback keeps them in a
+        # reference cycle, and the collector closes their queues before they have ended.
+        self._iterator = None
+        raise batch
 
     def state_dict(self) -> dict[str, int]:
         """Return the number of yielded batches of this pass, which Lightning stores."""

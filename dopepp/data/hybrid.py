@@ -66,10 +66,10 @@ class HybridSource:
         elif virtual is None and synthetic is None and real_fraction != 1:
             _log.warning("there are no virtual images: the real share is 1, not %g", real_fraction)
             real_fraction = 1.0
-        if synthetic is None or virtual is None:
-            synthetic_fraction = float(virtual is None and synthetic is not None)
         num_real = round(real_fraction * samples_per_epoch)
         num_synthetic = round((1 - real_fraction) * synthetic_fraction * samples_per_epoch)
+        if synthetic is None or virtual is None:
+            num_synthetic = 0 if synthetic is None else samples_per_epoch - num_real
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
         sources = enumerate((real, virtual, synthetic))
         self._sources = {

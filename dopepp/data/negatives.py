@@ -88,10 +88,8 @@ class UnlabelledRenders(WrappedSource):
 class FrameMix:
     """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n."""
 
-    def __init__(
-        self, sources: Sequence[DescribedSource], num_frames: int, name: str = "negatives"
-    ) -> None:
-        self.sources, self.name, self._length = tuple(sources), name, num_frames
+    def __init__(self, sources: Sequence[DescribedSource], num_frames: int) -> None:
+        self.sources, self.name, self._length = tuple(sources), "negatives", num_frames
 
     def __len__(self) -> int:
         return self._length

@@ -15,7 +15,6 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,6 +26,9 @@ from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, check
 from dopepp.data.formats import RECORD_FILE, Writer
+from dopepp.data.formats.bop.bop_writer import BopWriter
+from dopepp.data.formats.ndds.ndds_writer import NddsWriter
+from dopepp.data.formats.webdataset.webdataset_writer import WebdatasetWriter
 from dopepp.data.rendered import rendered_sample
 from dopepp.data.sample import Sample
 from dopepp.geometry.camera import invert_transform
@@ -40,12 +42,11 @@ from dopepp.virtual.presets.view import View, read_lens
 
 _log = logging.getLogger(__name__)
 
-WRITERS: Final = {
-    "bop": ("dopepp.data.formats.bop.bop_writer", "BopWriter"),
-    "ndds": ("dopepp.data.formats.ndds.ndds_writer", "NddsWriter"),
-    "webdataset": ("dopepp.data.formats.webdataset.webdataset_writer", "WebdatasetWriter"),
+WRITERS: Final[dict[str, Callable[[Path, Sequence[Part]], Writer]]] = {
+    "bop": BopWriter,
+    "ndds": NddsWriter,
+    "webdataset": WebdatasetWriter,
 }
-"""Module and class of each layout's writer."""
 
 MAX_VIEWS: Final = 16
 RECORD_VERSION: Final = 1  # version of the record's layout
@@ -64,7 +65,7 @@ class RenderJob:
 
     def writer(self, root: Path) -> Writer:
         """Return a writer in the job's layout to the data set in folder ``root``."""
-        writer = _find_writer(self.layout)(root, self.factory.parts)
+        writer = WRITERS[self.layout](root, self.factory.parts)
         if self.views > 1:
             writer.chunk_size = self.views  # a folder for each static scene
         return writer
@@ -95,15 +96,14 @@ def make_job(
     working_distance: str | None = None,
     views: int = 1,
 ) -> RenderJob:
-    """Make a job from user input.
+    """Make a job from user input; the arguments are the options of ``dopepp render``.
 
     Args:
         parts: Built-in names, mesh files, or ``NAME=FILE`` to name a file's part.
         unit: Unit of the mesh files; None for the unit of the format, otherwise millimetres.
         preset: Name of a preset, which defines the random scenes.
         changes: Changed fields of the preset as ``field.field=value``, the value in YAML.
-        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels for :meth:`Preset.reframed`; None
-            for the preset's size.
+        size: ``WIDTHxHEIGHT`` in pixels for :meth:`Preset.reframed`; None for the preset's size.
         seed: Seed of all random choices of the job.
         backgrounds: Value for :func:`~dopepp.virtual.backgrounds.find_backgrounds`.
         negatives: Parts to show as distractors without labels, written like ``parts``.
@@ -112,11 +112,8 @@ def make_job(
         camera: File of the camera to simulate; None for the preset's camera.
         working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
         views: Number of cameras of each scene. More than 1 gives a folder per scene; BOP only.
-
-    Raises:
-        UserError: An argument is invalid, or a file is missing or invalid.
     """
-    _find_writer(layout)
+    check_choice("--format", layout, WRITERS)
     check("--views", views, int, Range(1, MAX_VIEWS))
     if views > 1 and layout != "bop":
         problem = f"--views {views} with --format {layout}"
@@ -155,13 +152,6 @@ def make_job(
     if views > 1:
         record["views"] = views
     return RenderJob(factory, layout, views, record)
-
-
-def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    check_choice("--format", layout, WRITERS)
-    module, name = WRITERS[layout]
-    writer: Callable[[Path, Sequence[Part]], Writer] = getattr(import_module(module), name)
-    return writer
 
 
 def named_part(text: str, unit: str | None) -> Part:
@@ -243,9 +233,7 @@ def is_claimed(root: Path) -> bool:
 
 
 def claim(root: Path, record: Mapping[str, Any]) -> None:
-    """Reserve a folder for a job by its record, and remove the files of interrupted writes.
-
-    A folder with an equal record is accepted.
+    """Reserve a folder by a job's record, unless reserved, and remove files of interrupted writes.
 
     Raises:
         UserError: The folder is not writable, or holds another job or other files.

@@ -78,14 +78,9 @@ def run(
 ) -> RenderReport:
     """Render the images of a job that its folder lacks, and show the progress on stderr.
 
-    Args:
-        job: Definition of the images.
-        out: Folder of the data set.
-        num: Number of images of the whole job, required.
-        shard: Part of the job to render, ``i/n`` with i from 0 to n − 1.
-        workers: Number of processes; None for one per core.
-        engine: An entry of :data:`ENGINES`.
-        ray_address: ``host:port`` of a Ray cluster; None starts a cluster on this machine.
+    The arguments are the options of ``dopepp render``: ``num`` images in the whole job, of which
+    the part ``shard`` (``i/n``) is rendered by ``workers`` processes (default: one per core).
+    Without an address (``host:port``), the engine ``ray`` starts a cluster on this machine.
 
     Raises:
         UserError: An argument is invalid, or the folder holds another job or other files.
@@ -94,7 +89,7 @@ def run(
     if num is None:
         raise UserError("no number of images", "-n NUMBER, or --preview", "add e.g. -n 1000")
     part, workers = Shard.parse(shard), available_cores() if workers is None else workers
-    check("--workers", workers, int, Range(1, MAX_WORKERS))
+    num_workers = check("--workers", workers, int, Range(1, MAX_WORKERS))
     check_choice("--engine", engine, ENGINES)
     if engine != "ray" and ray_address is not None:
         problem = f"--ray-address {ray_address} with --engine {engine}"
@@ -102,8 +97,8 @@ def run(
 
     def open_pool(content: bytes) -> Pool:
         if engine == "ray":
-            return ClusterPool(content, ray_address, workers)
-        return ProcessPool(content, workers)
+            return ClusterPool(content, ray_address, num_workers)
+        return ProcessPool(content, num_workers)
 
     with ProgressDisplay(Console(stderr=True)) as progress:
         return render_dataset(job, out, num, open_pool, part, progress)
@@ -204,18 +199,10 @@ def render_dataset(
     shard: Shard | None = None,
     on_progress: OnProgress = lambda done, total: None,
 ) -> RenderReport:
-    """Render the missing images of a job, or of a shard, into a folder.
+    """Render the missing ones of a job's ``num_items`` images, or of a shard, into a folder.
 
     Existing images are kept, so a run resumes after any interruption. Several shards may share the
     folder simultaneously; the shard that completes a chunk finalizes it.
-
-    Args:
-        job: Definition of the images.
-        root: Folder of the data set.
-        num_items: Number of images of the whole job.
-        open_pool: See :data:`OpenPool`.
-        shard: Part of the job; None for the whole job.
-        on_progress: See :data:`OnProgress`.
 
     Raises:
         UserError: The number is out of range, or the folder holds another job or other files.

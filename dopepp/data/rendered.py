@@ -129,8 +129,7 @@ class CachedSource(WrappedSource):
         input_size: (width, height) that bounds the resized images, which lose their depth; None
             keeps size and depth.
         folder: Folder of the files, in subfolders named by a hash of everything that determines the
-            items; None keeps the items in memory.
-        identity: Version of the code, or other text that determines the items besides the source.
+            items (besides the source, ``identity``); None keeps the items in memory.
 
     Raises:
         UserError: The cache needs more than half of the machine's memory, or the disk is full.
@@ -258,9 +257,13 @@ class CachedSource(WrappedSource):
 
 def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
     """Return the dtype of a slot: one sample with an image of ``shape``."""
-    instance = [("T_cam_obj", "f8", (4, 4)), ("keypoints", "f8", (9, 2))]
+    instance: list[tuple[Any, ...]] = [("T_cam_obj", "f8", (4, 4)), ("keypoints", "f8", (9, 2))]
     instance += [("visible_fraction", "f8"), ("has_mask", "?"), ("label", f"U{_TEXT_LENGTH}")]
-    fields = [("image", "u1", (*shape, 3)), ("labels", "u1", shape), ("K", "f8", (3, 3))]
+    fields: list[tuple[Any, ...]] = [
+        ("image", "u1", (*shape, 3)),
+        ("labels", "u1", shape),
+        ("K", "f8", (3, 3)),
+    ]
     fields += [("key", f"U{_TEXT_LENGTH}"), ("num_instances", "i4")]
     fields += [("instances", instance, (_MAX_INSTANCES,))]
     return np.dtype(fields + ([("depth", "f4", shape)] if has_depth else []))

@@ -94,11 +94,8 @@ BUILTIN: Final[dict[str, Callable[[], Part]]] = {
 def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
-    The part's size is logged, as a warning if the diameter is outside 1 cm – 2 m.
-
-    Args:
-        path_or_name: Mesh file, or name of a built-in part.
-        unit: Unit of the file (default: as stated by its format, otherwise millimetres).
+    The part's size is logged, as a warning if the diameter is outside 1 cm – 2 m. The file's unit
+    is by default as stated by its format, otherwise millimetres.
 
     Raises:
         UserError: The part or file does not exist, or the file is invalid (see
@@ -121,16 +118,11 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
 def with_meshes(
     parts: Sequence[Part], given: Sequence[str] = (), unit: str | None = None
 ) -> list[Part]:
-    """Return a checkpoint's parts, each with a mesh.
+    """Return a checkpoint's parts, each with a mesh, in order.
 
-    Args:
-        parts: Parts of the checkpoint.
-        given: Meshes that replace the checkpoint's meshes, as ``NAME=FILE``. NAME may be omitted if
-            it is the file's stem or if there is a single part.
-        unit: Unit of the mesh files; None for the unit of their format.
-
-    Returns:
-        The parts in order. A warning is logged if a mesh differs from the trained mesh.
+    ``given`` meshes, as ``NAME=FILE``, replace the checkpoint's meshes. NAME may be omitted if it
+    is the file's stem or if there is a single part. A warning is logged if a mesh differs from the
+    trained mesh.
 
     Raises:
         UserError: A part has no mesh, a name is unknown, or a file is invalid.

@@ -24,10 +24,7 @@ _OWN_MIRROR: Final = 0.015  # Largest mirror distance of a part that equals its 
 def lookalikes(parts: Sequence[Part]) -> list[Part]:
     """Return look-alikes of parts: mirrored, stretched along the longest side, with an end cut off.
 
-    A part that equals its mirror image has no mirrored copy.
-
-    Args:
-        parts: Parts; parts without a mesh are ignored.
+    A part that equals its mirror image has no mirrored copy. Parts without a mesh are ignored.
     """
     return [
         make_part(f"{part.name}, {kind}", mesh)

@@ -42,9 +42,7 @@ Symmetries = tuple[Float[np.ndarray, "symmetries 4 4"], tuple[ContinuousSymmetry
 def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
     """Find the rigid transforms that map a surface onto itself, for any triangulation.
 
-    Args:
-        mesh: Triangles, metres.
-        tolerance: Largest distance of a moved surface point from the surface, diameters.
+    ``tolerance`` is the largest distance of a moved surface point from the surface, diameters.
 
     Returns:
         Discrete symmetries without the identity, metres (at most a half turn for a round part),

@@ -10,11 +10,10 @@ from __future__ import annotations
 import fcntl
 import json
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -26,8 +25,6 @@ from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.parts.part import Part
 
-T = TypeVar("T")
-
 STAGING: Final = ".items"  # folder of staged items; readers skip hidden names
 
 RECORD_FILE: Final = "_dopepp_render.json"
@@ -37,7 +34,6 @@ ESTIMATED: Final = (
     "estimated: mask pixels, or the hull's pixels inside the image, over the hull of the points"
 )
 
-_LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
 
 
@@ -129,7 +125,11 @@ def encode_by_key(content: Mapping[str, object]) -> bytes:
 
 def stage_item(path: Path, content: bytes) -> None:
     """Write an item to a file in a staging folder that other processes may remove meanwhile."""
-    _retry(lambda: write_file(path, content))
+    # A folder removed before its use is not found; a folder removed within ``mkdir`` "exists".
+    for _ in range(_ATTEMPTS - 1):
+        with suppress(FileNotFoundError, FileExistsError):
+            return write_file(path, content)
+    return write_file(path, content)
 
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
@@ -140,46 +140,8 @@ def staged_items(staging: Path, suffix: str) -> list[Path]:
 
 
 @contextmanager
-def lock_staging(staging: Path) -> Iterator[None]:
-    """Lock a folder of staged items, and remove the folder on exit if it is empty.
-
-    Otherwise, a process could remove items that another process has just staged. The system
-    releases the lock of a killed process.
-    """
-    path = staging / _LOCK
-    while True:
-        descriptor = _retry(lambda: _open(path))
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # The previous holder may have removed the file; a new file is locked then.
-            if not _is_open_file(descriptor, path):
-                continue
-            yield
-            if not any(entry.name != _LOCK for entry in staging.iterdir()):
-                path.unlink()
-                with suppress(OSError):  # another process may have just staged an item
-                    staging.rmdir()
-            return
-        finally:
-            os.close(descriptor)
-
-
-def _open(path: Path) -> int:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return os.open(path, os.O_RDWR | os.O_CREAT)
-
-
-def _retry(act: Callable[[], T]) -> T:
-    """Repeat ``act``, at most 100 times, if another process removes its folder during the call."""
-    # A folder removed before its use is not found; a folder removed within ``mkdir`` "exists".
-    for _ in range(_ATTEMPTS - 1):
-        with suppress(FileNotFoundError, FileExistsError):
-            return act()
-    return act()
-
-
-def _is_open_file(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
+def locked(path: Path) -> Iterator[None]:
+    """Lock a file against other processes; the system releases the lock of a killed process."""
+    with path.open("r+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

@@ -14,7 +14,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.random import Generator
 
 from dopepp.core.validation import Checked, Share
@@ -22,73 +22,49 @@ from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.drawing.pictures import Mask, RGBImage, Shape
 from dopepp.virtual.backgrounds import Backgrounds
 
-MIN_PATCH_PX: Final = 2  # A patch of one pixel is always a solid colour.
+MIN_PATCH_PX: Final = 2  # a patch of one pixel is always a solid colour
 MIN_CONTRAST: Final = 3.0  # standard deviation of a colour channel of a crop, grey levels
-
-MAX_DRAWS: Final = 8  # Largest number of crops to sample from an image.
+MAX_DRAWS: Final = 8  # random crops per patch size, and then in other images
 
 
 class BackgroundCrops:
-    """Sampler of rectangular crops of an image, without padding, that show no object.
+    """Sampler of rectangular crops, without a pixel of ``silhouettes``, of an unpadded image."""
 
-    No crop contains a pixel of ``silhouettes``. :meth:`draw` tries ``max_draws`` random crops.
-    """
-
-    def __init__(
-        self,
-        image: RGBImage,
-        silhouettes: Sequence[Mask],
-        min_contrast: float = MIN_CONTRAST,
-        max_draws: int = MAX_DRAWS,
-    ) -> None:
-        self.image, self.min_contrast, self.max_draws = image, min_contrast, max_draws
-        occupied = np.zeros(image.shape[:2], bool)
-        for mask in silhouettes:
-            occupied |= mask
+    def __init__(self, image: RGBImage, silhouettes: Sequence[Mask]) -> None:
+        self.image = image
+        occupied = np.any([np.zeros(image.shape[:2], bool), *silhouettes], axis=0)
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
     def draw(self, size: Shape, rng: Generator) -> RGBImage | None:
-        """Return the first of ``max_draws`` random (height, width) crops with contrast, or None."""
-        windows = np.flatnonzero(self._is_free(size).ravel())
-        for _ in range(self.max_draws if len(windows) else 0):
-            crop = self._crop(int(rng.choice(windows)), size)
-            if has_contrast(crop, self.min_contrast):
-                return crop
-        return None
-
-    def search(self, size: Shape, rng: Generator) -> RGBImage | None:
-        """Return a random crop among all crops of (height, width) that have contrast.
-
-        If there are none, return a random crop with at least two colours, or None.
-        """
-        free = self._is_free(size)
-        if not free.any():
-            return None
-        sums, squares = self._moments
-        num = size[0] * size[1]
-        # num²·variance is an integer below 2⁵³, so a single colour gives exactly 0.
-        spread = (num * _windows(squares, size) - _windows(sums, size) ** 2).max(axis=2)
-        spread[~free] = 0
-        for least in ((num * self.min_contrast) ** 2, 1.0):
-            windows = np.flatnonzero(spread.ravel() >= least)
-            if len(windows):
-                return self._crop(int(rng.choice(windows)), size)
-        return None
-
-    def largest(self, size: Shape, rng: Generator) -> RGBImage | None:
-        """Return a crop of (height, width), halved until :meth:`search` finds one, or None."""
+        """Return a crop of (height, width), halved until there is one with contrast, or None."""
         height, width = size
         while True:
-            crop = self.draw((height, width), rng)
-            if crop is None:
-                crop = self.search((height, width), rng)
+            crop = self._draw((height, width), rng)
             if crop is not None or max(height, width) == MIN_PATCH_PX:
                 return crop
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
-    def _is_free(self, size: Shape) -> Bool[np.ndarray, "rows columns"]:
-        """Return whether a window of ``size`` shows no object, for each top left corner."""
-        return np.asarray(_windows(self._integral, size) == 0)
+    def _draw(self, size: Shape, rng: Generator) -> RGBImage | None:
+        """Return the first of a few random crops with contrast, or else any such crop.
+
+        If no crop has contrast, return a random crop with at least two colours, or None.
+        """
+        free = _windows(self._integral, size) == 0
+        windows = np.flatnonzero(free.ravel())
+        for _ in range(MAX_DRAWS if len(windows) else 0):
+            crop = self._crop(int(rng.choice(windows)), size)
+            if has_contrast(crop):
+                return crop
+        sums, squares = self._moments
+        num = size[0] * size[1]
+        # num²·variance is an integer below 2⁵³, so a single colour gives exactly 0.
+        spread = (num * _windows(squares, size) - _windows(sums, size) ** 2).max(axis=2, initial=0)
+        spread[~free] = 0
+        for least in ((num * MIN_CONTRAST) ** 2, 1.0):
+            windows = np.flatnonzero(spread.ravel() >= least)
+            if len(windows):
+                return self._crop(int(rng.choice(windows)), size)
+        return None
 
     @cached_property
     def _moments(self) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
@@ -112,9 +88,9 @@ def _windows(integral: np.ndarray, size: Shape) -> np.ndarray:
     )
 
 
-def has_contrast(crop: RGBImage, min_contrast: float) -> bool:
-    """Return whether a channel's standard deviation is at least ``min_contrast`` grey levels."""
-    return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
+def has_contrast(crop: RGBImage) -> bool:
+    """Return whether a channel's standard deviation is at least ``MIN_CONTRAST``."""
+    return float(crop.reshape(-1, 3).std(axis=0).max()) >= MIN_CONTRAST
 
 
 def mask_slices(mask: Mask) -> tuple[slice, slice]:
@@ -152,31 +128,28 @@ class RandomMask(Checked):
         probability: Probability that an instance gets a patch.
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
-        min_contrast: Contrast that a patch should have, see :func:`has_contrast`.
-        max_draws: Number of random crops to try per patch size, and then in other images.
     """
 
     probability: Share = 0.5
     max_height: Share = 0.8
     max_width: Share = 0.8
-    min_contrast: float = MIN_CONTRAST
-    max_draws: int = MAX_DRAWS
 
     def __call__(self, sample: Sample, rng: Generator, other: Backgrounds) -> Sample:
         """Return a masked copy of an unpadded sample; ``other`` replaces a missing background."""
-        silhouettes = [
-            silhouette(instance, sample.image.shape[:2]) for instance in sample.instances
-        ]
-        crops = BackgroundCrops(sample.image, silhouettes, self.min_contrast, self.max_draws)
-        image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
+        shape = sample.image.shape[:2]
+        silhouettes = [silhouette(instance, shape) for instance in sample.instances]
+        crops = BackgroundCrops(sample.image, silhouettes)
+        image, covered = sample.image.copy(), np.zeros(shape, bool)
         for object_mask in silhouettes:
             if rng.random() >= self.probability or not object_mask.any():
                 continue
             patch = self._patch(object_mask, rng)
             if patch is None:
                 continue
-            height, width = (side.stop - side.start for side in patch)
-            crop = self._crop(crops, (height, width), rng, other)
+            size = patch[0].stop - patch[0].start, patch[1].stop - patch[1].start
+            crop = crops.draw(size, rng)
+            if crop is None:
+                crop = _crop_of(other, shape, size, rng)
             if crop is not None:
                 rows, columns = map(_middle_slice, patch, crop.shape)
                 image[rows, columns], covered[rows, columns] = crop, True
@@ -197,25 +170,18 @@ class RandomMask(Checked):
             slices.append(slice(offset, offset + length))
         return slices[0], slices[1]
 
-    def _crop(
-        self, crops: BackgroundCrops, size: Shape, rng: Generator, other: Backgrounds
-    ) -> RGBImage | None:
-        """Return a random crop of the image's background, at most (height, width) in size.
 
-        If there is none, try ``max_draws`` crops from ``other``; None if none has enough contrast.
-        """
-        crop = crops.largest(size, rng)
-        if crop is not None:
+def _crop_of(other: Backgrounds, shape: Shape, size: Shape, rng: Generator) -> RGBImage | None:
+    """Return a crop with contrast of one of a few other images, of ``shape``, or None."""
+    (height, width), (rows, columns) = shape, size
+    for _ in range(MAX_DRAWS):
+        background = other.draw(rng, width, height)
+        row = int(rng.integers(0, height - rows + 1))
+        column = int(rng.integers(0, width - columns + 1))
+        crop = background[row : row + rows, column : column + columns]
+        if has_contrast(crop):
             return crop
-        height, width = crops.image.shape[:2]
-        for _ in range(self.max_draws):
-            background = other.draw(rng, width, height)
-            row = int(rng.integers(0, height - size[0] + 1))
-            column = int(rng.integers(0, width - size[1] + 1))
-            crop = background[row : row + size[0], column : column + size[1]]
-            if has_contrast(crop, self.min_contrast):
-                return crop
-        return None
+    return None
 
 
 def _middle_slice(patch: slice, length: int) -> slice:

@@ -137,7 +137,7 @@ class _Cover:
         height, width = (
             max(MIN_PATCH_PX, int(rng.uniform(*_SIDES) * extent[axis])) for axis in (0, 1)
         )
-        return crops.largest((height, width), rng)
+        return crops.draw((height, width), rng)
 
     def _add_patch(self, crop: RGBImage, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
         """Insert a crop below earlier crops, at a random place over ``pixel`` (row, column)."""

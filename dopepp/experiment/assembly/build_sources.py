@@ -174,8 +174,7 @@ FORMATS: Final[dict[str, Opener]] = {
     "ycb_video": lambda data, root, parts, seed, split: YcbVideoReader(
         root,
         parts,
-        data.image_set(split) if data.frames is None else None,
-        frames=data.frames,
+        data.image_set(split) if data.frames is None else data.frames,
         seed=seed,
         read_depth=split == "test",
     ),

@@ -95,7 +95,8 @@ def largest_distance(points: Points) -> float:
     if rank == 0:
         return 0.0
     if rank == 1:
-        return float(np.ptp(offsets @ axes[0]))
+        along = offsets @ axes[0]
+        return float(np.linalg.norm(points[along.argmax()] - points[along.argmin()]))
     flat = offsets @ axes[:rank].T
     corners = points if _is_round(flat) else points[scipy.spatial.ConvexHull(flat).vertices]
     if len(corners) > _FEW_CORNERS:

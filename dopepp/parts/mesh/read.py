@@ -46,13 +46,9 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, and convert it to metres.
 
     Duplicate STL vertices are merged, zero-area triangles dropped, and the others oriented
-    consistently. Surfaces may have holes, and triangles may intersect each other. OBJ, PLY and GLB
-    files may have a texture, PLY files also colours and normals.
-
-    Args:
-        path: Mesh file, whose suffix states the format; a texture must lie in its folder.
-        unit: mm, cm, m or inch (default: as stated by a 3MF file, metres for GLB, and otherwise
-            millimetres, with a warning).
+    consistently. Surfaces may have holes, and triangles may intersect each other. The unit is mm,
+    cm, m or inch (default: as stated by a 3MF file, metres for GLB, and otherwise millimetres, with
+    a warning). A texture must lie in the mesh's folder.
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
@@ -240,7 +236,8 @@ def misoriented_faces(
         if _signed_volumes(vertices, flip_faces(faces, inverted)).sum() < 0:
             inverted = ~inverted
         oriented = flip_faces(faces, inverted)
-        count, bodies = connected(*topology.neighbours.T, len(faces))
+        first_face, second_face = topology.neighbours.T
+        count, bodies = connected(first_face, second_face, len(faces))
         volumes = np.bincount(bodies, _signed_volumes(vertices, oriented), minlength=count)
         corner_bodies = np.repeat(bodies, 3)
         boxes = _bounding_boxes(vertices[oriented].reshape(-1, 3), corner_bodies, count)

@@ -142,7 +142,7 @@ BOP = {
     "gt missing": read(GT, None, "scene_gt.json: file: missing"),
     "camera missing": Case(CAMERA, None, "scene_camera.json: file: missing"),
     "gt cut": Case(GT, half, "scene_gt.json: JSON: line"),
-    "gt NaN": Case(GT, instead(b'"obj_id": 1', b'"obj_id": NaN'), "scene_gt.json: JSON: line"),
+    "gt NaN": Case(GT, instead(b'"obj_id": 1', b'"obj_id": NaN'), "scene_gt.json: JSON: 'NaN'"),
     "gt list": Case(GT, b"[]", "scene_gt.json: top level"),
     "no gt": read(f"{GT}:1", None, "scene_gt.json: 1: missing"),
     "no camera": read(f"{CAMERA}:1", None, "scene_camera.json: 1: missing"),

@@ -57,9 +57,8 @@ class InlinePool(Pool):
 @pytest.fixture(scope="module", params=WRITERS)
 def layout(request):
     """A layout, with chunks of four images."""
-    module, name = WRITERS[request.param]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(f"{module}.{name}.chunk_size", 4)
+        patch.setattr(WRITERS[request.param], "chunk_size", 4)
         yield request.param
 
 

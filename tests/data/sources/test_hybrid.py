@@ -82,6 +82,8 @@ def test_a_missing_source_gives_its_share_to_the_others(caplog):
 
     assert counts(None, named("virtual", 5)) == (0, 10, 0)
     assert counts(named("real", 5), None, named("synthetic", 5), 0.2) == (3, 0, 7)
+    real, synthetic = named("real", 5), named("synthetic", 5)
+    assert HybridSource(real, None, 0.5, 5, 0, synthetic).counts == (2, 0, 3)
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         assert counts(named("real", 5), None) == (10, 0, 0)

@@ -128,7 +128,7 @@ def test_a_users_mesh_with_its_unit(tiny, tmp_path):
         ("data.objects=[003_cracker_box]", "without data.root"),
         ("data.frames=[0050/000003]", "without data.root"),
         ("data=ycb_video", "data=ycb_video without data.root"),
-        ("data.root=/nowhere", "data.root=/nowhere, which is not a folder"),
+        ("data.root=/nowhere", "data.root=/nowhere, which has no data/"),
         ("data.batch_size=9", "8 training images for batches of 9"),
         ("virtual.preset=moon", "preset 'moon'"),
         ("++virtual.scene.gravity=1", "virtual.scene.gravity=1"),

@@ -10,10 +10,10 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -60,9 +60,9 @@ class BopPoses:
     visible_fractions: Float[np.ndarray, " objects"]
     inexact: Bool[np.ndarray, " objects"]
 
-    def select(self, is_selected: Bool[np.ndarray, " objects"]) -> BopPoses:
+    def select(self, selected: Bool[np.ndarray, " objects"] | slice) -> BopPoses:
         """Return the selected objects."""
-        return BopPoses(*(values[is_selected] for values in vars(self).values()))
+        return BopPoses(*(values[selected] for values in vars(self).values()))
 
     def without_model(self, models: Collection[int]) -> Counter[int]:
         """Count the objects whose number is not in ``models``; count none if that is empty."""
@@ -169,12 +169,10 @@ def is_number(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
-class SceneRecords(NamedTuple):
-    """Records of a scene's JSON files by image; ``infos`` has an entry for each truth, or None."""
-
-    cameras: Mapping[int, object]
-    truths: Mapping[int, list[Record]]
-    infos: Mapping[int, list[Record | None]]
+SceneRecords = tuple[
+    Mapping[int, object], Mapping[int, list[Record]], Mapping[int, list[Record | None]]
+]
+"""Cameras, truths and infos by image; the infos have an entry for each truth, or None."""
 
 
 def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
@@ -189,7 +187,7 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - objects}
     for image, records in objects.items():
         paired[image] = pair_infos(records, infos.get(image), gt_info[f"{image}"])
-    return SceneRecords(cameras, objects, paired)
+    return cameras, objects, paired
 
 
 def _by_image(node: Node) -> dict[int, Any]:
@@ -224,85 +222,57 @@ def image_files(scene: Path, kind: Kind, problems: Problems = STRICT) -> dict[in
 
 
 @dataclass(frozen=True)
-class BopScene:
-    """Images of a scene and their requested objects, in the order of the images' numbers.
+class BopImage:
+    """An image and its objects.
 
     Attributes:
-        files: Paths of the colour images relative to ``folder``; empty for a missing file.
-        depth_files: Paths of the depth images relative to ``folder``; empty for a missing file.
-        depth_scales: Millimetres per unit of the depth images; NaN where not stated.
-        first: Image i has the objects ``first[i] … first[i + 1] − 1``.
-        gt_ids: Each object's index in its image's list, which names its masks.
-        num_other: Number of objects with a model that are omitted, as they were not requested.
-        without_model: Counts of objects without a model, by object number.
-        num_behind: Number of requested objects behind the camera, which are omitted.
+        number: Number of the image in its scene.
+        file: The colour image; None if it is missing.
+        depth_file: The depth image, which may be missing; None in a scene without depth images.
+        depth_scale: Millimetres per unit of the depth image; NaN if not stated.
+        gt_ids: Each object's index in the image's list, which names its masks.
     """
 
-    folder: Path
-    image_ids: Int[np.ndarray, " images"]
-    files: list[str]
-    depth_files: list[str]
-    K: Float[np.ndarray, "images 3 3"]
-    depth_scales: Float[np.ndarray, " images"]
-    first: Int[np.ndarray, " bounds"]
+    scene: Path
+    number: int
+    file: Path | None
+    depth_file: Path | None
+    K: Float[np.ndarray, "3 3"]
+    depth_scale: float
     gt_ids: Int[np.ndarray, " objects"]
     poses: BopPoses
-    num_other: int
-    without_model: Counter[int]
-    num_behind: int
 
-    def objects(self, row: int) -> slice:
-        """Return the slice of the objects on image ``row``."""
-        return slice(int(self.first[row]), int(self.first[row + 1]))
+    def select(self, is_selected: Bool[np.ndarray, " objects"]) -> BopImage:
+        """Return the image with only some of its objects."""
+        return replace(self, gt_ids=self.gt_ids[is_selected], poses=self.poses.select(is_selected))
 
 
-def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> BopScene:
-    """Read a scene's annotation: ``scene_camera.json`` and, if present, its ground truth.
-
-    Only objects in ``wanted`` are kept. ``with_model`` holds the objects with a model, and is empty
-    in a data set without models.
-    """
+def read_scene(folder: Path) -> list[BopImage]:
+    """Read the annotation of a scene's images: ``scene_camera.json`` and, if present, the truth."""
     cameras, truths, infos = read_records(folder)
-    images = sorted(cameras)
+    numbers = sorted(cameras)
     if without_camera := truths.keys() - cameras.keys():
         problem = f"ignoring {len(without_camera)} images with ground truth but without a camera"
         _log.warning("%s: %s; first: %d", folder, problem, min(without_camera))
-    owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
-    owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
+    owners = [(i, n) for i in numbers for n in range(len(truths.get(i, ())))]
 
     def nodes(record_kind: str, number: int) -> Node:
         node = Node(STRICT, folder / f"scene_{record_kind}.json")
-        row, *n = (number,) if record_kind == "camera" else owners[number]
-        node = node[f"{images[row]}"]
-        return node[n[0]] if n else node
+        if record_kind == "camera":
+            return node[f"{numbers[number]}"]
+        image, n = owners[number]
+        return node[f"{image}"][n]
 
-    K, scales = read_cameras([cameras[i] for i in images], nodes)
-    poses = read_poses(
-        [truths[images[row]][n] for row, n in owners],
-        [infos[images[row]][n] for row, n in owners],
-        nodes,
-    )
-    table = np.array(owners, np.int64).reshape(-1, 2)
-    is_wanted = np.isin(poses.obj_ids, sorted(wanted))
-    is_behind = poses.T_cam_obj[:, 2, 3] <= 0
-    keep = is_wanted & ~is_behind
-    without_model = poses.select(~is_wanted).without_model(with_model)
-    return BopScene(
-        folder,
-        np.array(images, np.int64),
-        _relative_files(folder, IMAGES, images),
-        _relative_files(folder, DEPTHS, images),
-        K,
-        scales,
-        first=np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
-        gt_ids=table[keep, 1],
-        poses=poses.select(keep),
-        num_other=int((~is_wanted).sum()) - without_model.total(),
-        without_model=without_model,
-        num_behind=int((is_wanted & is_behind).sum()),
-    )
-
-
-def _relative_files(folder: Path, kind: Kind, images: Sequence[int]) -> list[str]:
-    files = image_files(folder, kind)
-    return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]
+    K, scales = read_cameras([cameras[i] for i in numbers], nodes)
+    poses = read_poses([truths[i][n] for i, n in owners], [infos[i][n] for i, n in owners], nodes)
+    files, depth_files = image_files(folder, IMAGES), image_files(folder, DEPTHS)
+    images, first = [], 0
+    for row, number in enumerate(numbers):
+        last = first + len(truths.get(number, ()))
+        expected = folder / "depth" / f"{number:06d}.png"
+        depth_file = depth_files.get(number, expected) if depth_files else None
+        objects, gt_ids = poses.select(slice(first, last)), np.arange(last - first)
+        scale, file = float(scales[row]), files.get(number)
+        images.append(BopImage(folder, number, file, depth_file, K[row], scale, gt_ids, objects))
+        first = last
+    return images

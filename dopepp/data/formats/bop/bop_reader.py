@@ -21,11 +21,11 @@ from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
 from dopepp.core.validation import Range, parse
 from dopepp.data.formats import ESTIMATED, bop, make_instance, share_slice
-from dopepp.data.formats.bop import BopScene, read_scene
+from dopepp.data.formats.bop import BopImage, read_scene
 from dopepp.data.formats.bop.bop_models import objects_with_model, parts_by_id, read_models
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
-from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.drawing.pictures import DepthMap, Shape, Size, read_content
+from dopepp.data.sample import Sample, SourceInfo
+from dopepp.drawing.pictures import Shape, Size, read_content
 from dopepp.geometry.camera import CameraMatrix, check_camera, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Part
@@ -94,9 +94,12 @@ class BopReader:
         self.root, self.split, self.name = Path(root), split, f"bop/{split}"
         self._parts = parts_by_id(self.root, parts)
         self._read_depth = read_depth
+        self._num_behind, self._others = 0, Counter[int]()
         with_model = objects_with_model(read_models(self.root))
         folders = _scene_folders(self.root, split)
-        self._scenes = [read_scene(folder, self._parts, with_model) for folder in folders]
+        self._images = [
+            self._select_objects(image) for folder in folders for image in read_scene(folder)
+        ]
         if targets == AUTO:
             is_present = split.startswith("test") and (self.root / TARGETS_FILE).is_file()
             targets = TARGETS_FILE if is_present else None
@@ -105,15 +108,20 @@ class BopReader:
         self._items = items[share_slice(len(items), part_of, self.name)]
         self._log_deviations(with_model)
 
-    def _find_items(self) -> list[tuple[BopScene, int]]:
-        listed = [
-            (scene, row)
-            for scene in self._scenes
-            for row, image in enumerate(scene.image_ids.tolist())
-            if self._targets is None or (int(scene.folder.name), image) in self._targets
-        ]
-        present = [(scene, row) for scene, row in listed if scene.files[row]]
-        num_listed = len(listed) if self._targets is None else len(self._targets)
+    def _select_objects(self, image: BopImage) -> BopImage:
+        """Count the objects to ignore, and return the image with the others."""
+        poses = image.poses
+        is_wanted = np.isin(poses.obj_ids, list(self._parts))
+        is_behind = poses.T_cam_obj[:, 2, 3] <= 0
+        self._num_behind += int((is_wanted & is_behind).sum())
+        self._others.update(poses.obj_ids[~is_wanted].tolist())
+        return image.select(is_wanted & ~is_behind)
+
+    def _find_items(self) -> list[BopImage]:
+        targets = self._targets
+        listed = [i for i in self._images if targets is None or _key(i) in targets]
+        present = [image for image in listed if image.file is not None]
+        num_listed = len(listed) if targets is None else len(targets)
         if not present:
             problem = f"no image under {self.root / self.split} ({num_listed:,} listed)"
             allowed = "at least one of the listed images in rgb/ or gray/"
@@ -125,36 +133,37 @@ class BopReader:
         return present
 
     def _log_deviations(self, with_model: Collection[int]) -> None:
-        other = sum(scene.num_other for scene in self._scenes)
-        behind = sum(scene.num_behind for scene in self._scenes)
-        without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
-        self._ignored = {"other_objects": other + without.total(), "behind_the_camera": behind}
-        if other or behind:
+        without = {
+            number: count
+            for number, count in sorted(self._others.items())
+            if number >= 0 and with_model and number not in with_model
+        }
+        other = self._others.total() - sum(without.values())
+        poses = [image.poses for image in self._images]
+        if other or self._num_behind:
             problem = f"{other:,} objects that are not among the parts"
-            problem += f" and {behind:,} behind the camera"
+            problem += f" and {self._num_behind:,} behind the camera"
             _log.info("%s: ignoring %s", self.name, problem)
-        if inexact := sum(int(scene.poses.inexact.sum()) for scene in self._scenes):
+        if inexact := sum(int(p.inexact.sum()) for p in poses):
             problem = f"{inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
             _log.warning("%s: %s; using the nearest rotations", self.name, problem)
         if without:
-            listed = ", ".join(f"{number} ({count:,})" for number, count in sorted(without.items()))
+            listed = ", ".join(f"{number} ({count:,})" for number, count in without.items())
             _log.warning("%s: ignoring objects without a model: %s", self.name, listed)
-        fractions = np.concatenate([scene.poses.visible_fractions for scene in self._scenes])
-        if unknown := int(np.isnan(fractions).sum()):
+        if unknown := sum(int(np.isnan(p.visible_fractions).sum()) for p in poses):
             _log.info("%s: %s objects' visible fractions are estimated", self.name, f"{unknown:,}")
         lacking = 0
-        for scene, row in self._items if self._targets is not None else ():
-            present = Counter(scene.poses.obj_ids[scene.objects(row)].tolist())
-            counts = self._target_counts(scene, row) or Counter()
+        for image in self._items if self._targets is not None else ():
+            present = Counter(image.poses.obj_ids.tolist())
+            counts = self._target_counts(image) or Counter()
             counted = self._parts.keys() | (counts.keys() - with_model if with_model else set())
             lacking += sum(max(0, counts[obj_id] - present[obj_id]) for obj_id in counted)
         if lacking:
             problem = "listed instances have no annotation or no model and are not counted"
             _log.warning("%s: %s %s", self.name, f"{lacking:,}", problem)
 
-    def _target_counts(self, scene: BopScene, row: int) -> Counter[int] | None:
-        assert self._targets is not None
-        return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
+    def _target_counts(self, image: BopImage) -> Counter[int] | None:
+        return None if self._targets is None else self._targets[_key(image)]
 
     def __len__(self) -> int:
         return len(self._items)
@@ -162,43 +171,34 @@ class BopReader:
     @cached_property
     def image_ids(self) -> list[tuple[str, int]]:
         """Name of the scene's folder and number of each image."""
-        return [(scene.folder.name, int(scene.image_ids[row])) for scene, row in self._items]
+        return [(image.scene.name, image.number) for image in self._items]
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an image; the epoch is ignored."""
-        scene, row = self._items[index]
-        path = scene.folder / scene.files[row]
-        image = decode_rgb(read_content(path), str(path))
+        item = self._items[index]
+        assert item.file is not None
+        image = decode_rgb(read_content(item.file), str(item.file))
         shape: Shape = image.shape[:2]
-        where = f"{scene.folder / 'scene_camera.json'}: image {scene.image_ids[row]}"
-        K = check_camera(scene.K[row], (shape[1], shape[0]), where)
-        objects = scene.objects(row)
-        numbers = range(objects.start, objects.stop)
-        instances = [self._instance(scene, k, path.stem, K, shape) for k in numbers]
-        if self._targets is not None and (counts := self._target_counts(scene, row)) is not None:
+        where = f"{item.scene / 'scene_camera.json'}: image {item.number}"
+        K = check_camera(item.K, (shape[1], shape[0]), where)
+        instances = []
+        for n, gt_id in enumerate(item.gt_ids.tolist()):
+            path = item.scene / "mask_visib" / f"{item.file.stem}_{gt_id:06d}.png"
+            mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
+            part, T_cam_obj = self._parts[int(item.poses.obj_ids[n])], item.poses.T_cam_obj[n]
+            fraction = float(item.poses.visible_fractions[n])
+            instances.append(make_instance(part, T_cam_obj.copy(), K, fraction, mask, shape))
+        if (counts := self._target_counts(item)) is not None:
             remaining = Counter({part.name: counts[n] for n, part in self._parts.items()})
             for instance in sorted(instances, key=lambda instance: -instance.visible_fraction):
                 instance.wanted = remaining[instance.label] > 0
                 remaining[instance.label] -= 1
-        depth = self._depth(scene, row, shape) if self._read_depth else None
-        key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
+        depth, depth_file = None, item.depth_file
+        if self._read_depth and depth_file is not None:
+            content = read_content(depth_file)
+            depth = decode_depth(content, str(depth_file), item.depth_scale, shape)
+        key = f"{item.scene.name}/{item.number:06d}"
         return Sample(image, K, instances, depth, self.name, key)
-
-    def _instance(
-        self, scene: BopScene, k: int, stem: str, K: CameraMatrix, shape: Shape
-    ) -> Instance:
-        path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
-        mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
-        poses, part = scene.poses, self._parts[int(scene.poses.obj_ids[k])]
-        fraction = float(poses.visible_fractions[k])
-        return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
-
-    def _depth(self, scene: BopScene, row: int, shape: Shape) -> DepthMap | None:
-        if not any(scene.depth_files):
-            return None
-        expected = f"depth/{scene.image_ids[row]:06d}.png"
-        path = scene.folder / (scene.depth_files[row] or expected)
-        return decode_depth(read_content(path), str(path), float(scene.depth_scales[row]), shape)
 
     def view(self) -> tuple[Size, CameraMatrix, tuple[float, float] | None]:
         """Return the first image's (width, height) and K, and the range of the objects' depths.
@@ -208,8 +208,8 @@ class BopReader:
         """
         depths = [
             float(transform(T_cam_obj, self._parts[int(number)].cuboid[[CENTROID]])[0, 2])
-            for scene in self._scenes
-            for number, T_cam_obj in zip(scene.poses.obj_ids, scene.poses.T_cam_obj, strict=True)
+            for image in self._images
+            for number, T_cam_obj in zip(image.poses.obj_ids, image.poses.T_cam_obj, strict=True)
         ]
         first = self.sample(0)
         if not depths:
@@ -222,28 +222,30 @@ class BopReader:
 
     def describe(self) -> list[SourceInfo]:
         """Return one entry: hashes of annotations and meshes, and the visible fractions' origin."""
-        digest = hashlib.sha256()
-        unknown = 0
-        for scene, row in self._items:
-            poses, objects = scene.poses, scene.objects(row)
-            digest.update(f"{scene.folder.name}/{scene.image_ids[row]}".encode())
-            for array in (scene.K[row], poses.T_cam_obj[objects], poses.obj_ids[objects]):
+        digest, is_stated = hashlib.sha256(), True
+        for image in self._items:
+            poses = image.poses
+            digest.update(f"{image.scene.name}/{image.number}".encode())
+            for array in (image.K, poses.T_cam_obj, poses.obj_ids):
                 digest.update(np.ascontiguousarray(array).tobytes())
-            unknown += int(np.isnan(poses.visible_fractions[objects]).sum())
+            is_stated &= not np.isnan(poses.visible_fractions).any()
+        ignored = {"other_objects": self._others.total(), "behind_the_camera": self._num_behind}
         identity: dict[str, object] = {
             "annotation": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
-            "left_out": self._ignored,
-            "visible_fractions": "scene_gt_info.json" if not unknown else ESTIMATED,
+            "left_out": ignored,
+            "visible_fractions": "scene_gt_info.json" if is_stated else ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity, self._num_instances)]
 
     @cached_property
     def _num_instances(self) -> dict[str, int]:
-        counts: Counter[int] = Counter()
-        for scene, row in self._items:
-            counts.update(scene.poses.obj_ids[scene.objects(row)].tolist())
+        counts = Counter(number for image in self._items for number in image.poses.obj_ids.tolist())
         return {part.name: counts[object_id] for object_id, part in self._parts.items()}
+
+
+def _key(image: BopImage) -> tuple[int, int]:
+    return int(image.scene.name), image.number
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:

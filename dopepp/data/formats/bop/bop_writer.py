@@ -26,7 +26,7 @@ from dopepp.core.json import read_json
 from dopepp.data.formats import (
     STAGING,
     encode_by_key,
-    lock_staging,
+    locked,
     read_object,
     stage_item,
     staged_items,
@@ -57,10 +57,11 @@ class BopFolder(ABC):
     """
 
     chunk_size = 1000  # images in a scene, as in the rendered training sets of BOP
+    split = "train_pbr"
     suffix: str
 
-    def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
-        self.root, self.split, self._parts = Path(root), split, tuple(parts)
+    def __init__(self, root: str | Path, parts: Sequence[Part]) -> None:
+        self.root, self._parts = Path(root), tuple(parts)
 
     @abstractmethod
     def staging(self, chunk: int) -> Path:
@@ -95,17 +96,16 @@ class BopFolder(ABC):
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
         """Merge the staged images of a chunk into its files."""
         image_numbers = {index % self.chunk_size for index in indices}
-        # The hidden folder of all chunks or of this chunk.
-        staging = self.staging(chunk)
-        with lock_staging(staging if staging.name == STAGING else staging.parent):
+        # Shards on several machines share the folder.
+        with locked(self.root / MODEL_FOLDERS[0] / INFO_FILE):
             staged = self._staged(chunk)
             staged = {image: path for image, path in staged.items() if image in image_numbers}
             self.merge(chunk, staged)
             for path in staged.values():
                 path.unlink()
-            if staging.name != STAGING:
-                with suppress(OSError):  # the folder is missing, or has items left
-                    staging.rmdir()
+            for folder in (self.staging(chunk), self.staging(chunk).parent):
+                with suppress(OSError):  # the folder is missing, or has files left
+                    folder.rmdir()
 
     def _staged(self, chunk: int) -> dict[int, Path]:
         return {int(path.stem): path for path in staged_items(self.staging(chunk), self.suffix)}

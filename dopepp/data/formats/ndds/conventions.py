@@ -13,7 +13,7 @@ To add a convention, add its value to a ``Literal`` below, and its meaning to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, get_args
 
@@ -159,23 +159,18 @@ class NddsFinding:
     Attributes:
         error_px: Upper quartile of the instances' errors (:meth:`Observation.error_px`).
         rival_px: This quartile under the best convention with different poses.
-        undecided: Conventions of other units, axes or orders that give equal poses here.
     """
 
     convention: PoseConvention
     error_px: float
     rival_px: float
-    undecided: tuple[PoseConvention, ...]
     num_instances: int
 
     def __str__(self) -> str:
-        text = (
+        return (
             f"{self.convention} (reprojection error {self.error_px:.2g} px, next best convention "
             f"{self.rival_px:.3g} px, {self.num_instances} instances)"
         )
-        if self.undecided:
-            text += f"; equal poses under: {'; '.join(map(str, self.undecided))}"
-        return text
 
 
 def find_convention(observations: Sequence[Observation], where: str) -> NddsFinding:
@@ -195,14 +190,11 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
     least, reason, listed = errors[ranked[0]], "no known convention fits", ranked[:6]
     if least <= MAX_ERROR_PX:
         best = next(c for c in POSE_CONVENTIONS if errors[c] <= least + _ROUNDING_PX)
-        rivals = [convention for convention in ranked if convention != best]
-        equal = tuple(rival for rival in rivals if _same_poses(observations, best, rival))
-        others = [rival for rival in rivals if rival not in equal]
-        rival_px = min((errors[rival] for rival in others), default=np.inf)
+        rivals = [c for c in ranked if c != best and not _same_poses(observations, best, c)]
+        rival_px = min((errors[rival] for rival in rivals), default=np.inf)
         if rival_px >= _MIN_RATIO * errors[best] + _ROUNDING_PX:
-            undecided = tuple(rival for rival in equal if replace(rival, frame=best.frame) != best)
-            return NddsFinding(best, errors[best], rival_px, undecided, len(observations))
-        reason, listed = "two conventions fit equally well", [best, *others[:5]]
+            return NddsFinding(best, errors[best], rival_px, len(observations))
+        reason, listed = "two conventions fit equally well", [best, *rivals[:5]]
     figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in listed)
     raise UserError(
         f"{where}: {reason}; reprojection error: {figures}",

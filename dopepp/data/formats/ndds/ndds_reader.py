@@ -34,14 +34,11 @@ _MAX_COUNTED_ITEMS: Final = 1000  # takes about a second to read
 class NddsReader:
     """Reader of the items in an NDDS or FAT folder and in the folders below it.
 
-    Most files state a ``visibility`` that ignores the image's border: 1 or 0 for visible or not, or
-    the visible share of the silhouette. The reader then multiplies it by the share of the projected
-    cuboid inside the image. A visibility that is missing or −1 (nvisii: unknown) counts as 1. The
-    reader ignores and counts objects of other classes, and invisible objects behind the camera.
-
-    An instance has a mask if ``STEM.seg.png`` has a unique value for the instance: its
-    ``segmentation_id`` or its class's ``segmentation_class_id``. An item has depth if the unit of
-    ``STEM.depth.png`` is annotated or implied by FAT's naming (``.left``, ``.right``: 0.1 mm).
+    Most files state a ``visibility`` that ignores the image's border. The reader then multiplies it
+    by the share of the projected cuboid inside the image. A visibility that is missing or −1
+    (nvisii: unknown) counts as 1. Objects of other classes, and invisible objects behind the
+    camera, are ignored and counted. An instance has a mask if ``STEM.seg.png`` has a unique value
+    for it: its ``segmentation_id`` or its class's ``segmentation_class_id``.
 
     Args:
         parts: Objects to return. An instance's ``class`` is a part's name, FAT's form of that name

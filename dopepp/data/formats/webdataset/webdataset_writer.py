@@ -14,7 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from dopepp.core.files import draft, encode_image, write_file
+from dopepp.core.files import encode_image, partial_path, write_file
 from dopepp.data.formats import (
     STAGING,
     encode_by_key,
@@ -68,12 +68,14 @@ class WebdatasetWriter(BopFolder):
         path = self._shard(chunk)
         if staged:
             # The webdataset library's TarWriter writes the same archive but imports torch.
-            with (
-                draft(path) as partial,
-                tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as archive,
-            ):
-                for key, content in _merge_images([path, *staged.values()], chunk):
-                    _add_image(archive, key, content)
+            partial = partial_path(path)
+            try:
+                with tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as archive:
+                    for key, content in _merge_images([path, *staged.values()], chunk):
+                        _add_image(archive, key, content)
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
         # This also lists a shard that was finalized elsewhere and copied here.
         if path.exists():
             keys_path = path.with_name(KEY_FILE)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,7 +129,7 @@ def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
         node.report(f"cut short after {len(content)} bytes", _ALLOWED)
     try:
         # The other fields, e.g. vertmap, are large and not needed.
-        return dict(scipy.io.loadmat(io.BytesIO(content), variable_names=_FIELDS))
+        return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
     except Exception as error:  # damage makes SciPy raise any type
         node.report(f"damaged ({error})", _ALLOWED)
         return None

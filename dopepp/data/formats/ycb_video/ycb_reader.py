@@ -39,18 +39,16 @@ class YcbVideoReader:
     """Reader of the real or the synthetic frames of a YCB-Video folder.
 
     The visible fraction is the number of label pixels divided by the area of the convex hull of the
-    projected ADD points. The fraction is too small for a concave object (drill, mug), whose hull is
-    larger than the silhouette. Some releases label only some objects, so a posed object without a
-    label pixel has no mask on a real frame, and its fraction accounts for the image border only.
-    Labels in ``data_syn`` are complete, so an object without a label pixel has the fraction 0.
+    projected ADD points, which is too small for a concave object (drill, mug). Some releases label
+    only some objects, so a posed object without a label pixel has no mask on a real frame, and its
+    fraction accounts for the image border only. In ``data_syn``, its fraction is 0.
 
     Args:
         parts: Objects to return, named as in ``classes.txt``.
         image_set: Name of the list in ``image_sets/``, or its frames: ``0050/000003`` (real) or
             ``000000`` (synthetic).
-        subset: ``real`` reads ``data/``, ``synthetic`` reads ``data_syn/``.
-        backgrounds: Images for the transparent background of synthetic frames, which need them.
-        seed: Seed of the backgrounds, which change with the epoch.
+        backgrounds: Images for the transparent background of synthetic frames, which need them;
+            they change with ``seed`` and epoch.
 
     Raises:
         UserError: The folder, the list or a part's class is missing, or no frame is on disk.

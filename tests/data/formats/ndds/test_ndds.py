@@ -323,12 +323,11 @@ def test_noise_in_the_projections(tmp_path):
     assert_read(foreign, source)
 
 
-def test_indistinguishable_orders_are_logged(tmp_path):
+def test_indistinguishable_orders_are_accepted(tmp_path):
     foreign, turn = ForeignWriter(tmp_path), Rotation.from_quat([0.5, 0.5, 0.5, 0.5])
     foreign.item(0, BOX, pose=make_transform(turn.as_matrix(), np.array([0.01, 0.0, 0.4])))
     source = NddsReader(tmp_path, [BOX])
     assert_read(foreign, source)
-    assert "equal poses under: quaternion w,x,y,z" in str(source.finding)
 
 
 def test_an_item_with_another_convention_is_rejected(tmp_path):
