@@ -67,13 +67,13 @@ def settle(
 ) -> Poses | None:
     """Drop solids onto the plane z = 0, and return their poses at rest.
 
-    Results are cached on disk under a hash of all arguments. Lengths are metres.
+    Results are cached on disk under a hash of all arguments.
 
     Args:
-        solids: Convex pieces of every solid, object frame.
-        starts: Initial poses (object to world) without overlaps.
-        walls: Immovable convex pieces, world frame.
-        diameter: Diameter of the largest solid.
+        solids: Convex pieces of every solid, object frame, metres.
+        starts: Initial poses (object to world, metres) without overlaps.
+        walls: Immovable convex pieces, world frame, metres.
+        diameter: Diameter of the largest solid, metres.
 
     Returns:
         Poses like ``starts``, or None if the solids do not come to rest, or overlap by more than
