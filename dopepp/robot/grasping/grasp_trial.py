@@ -21,6 +21,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
+from dopepp.inference.refinement.outline import OutlineMesh, make_outline_mesh
 from dopepp.parts.catalogue import load_part
 from dopepp.robot.grasping.cell import HOME, JOINTS, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
@@ -42,6 +43,7 @@ from dopepp.robot.grasping.rehearsal import (
     draw_robot,
 )
 from dopepp.robot.grasping.selection import EstimatedPart, choose_part, choose_viewpoint
+from dopepp.robot.grasping.unexplained import Unexplained, find_unexplained
 from dopepp.robot.grasping.workbench import (
     Layout,
     MujocoView,
@@ -51,6 +53,7 @@ from dopepp.robot.grasping.workbench import (
 )
 
 if TYPE_CHECKING:
+    from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.inference.several_views.views_result import WorldDetection
     from dopepp.recovery.detection import Detection
@@ -136,6 +139,7 @@ class SceneObservation:
     parts: list[EstimatedPart]  # sorted by descending height
     joints: Joints
     second_view: str = ""  # as in :class:`Record`
+    unexplained: Unexplained | None = None  # regions of undetected parts in the last image
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,6 +219,12 @@ class Trials:
         lies_flat = self.task.rest == "front" and self.task.layout != "heap"
         tilt_deg = FLAT_TILT_DEG if lies_flat else 180.0
         return PoseEstimator.from_mesh(self.task.part, self.task.unit, distances, tilt_deg)
+
+    @cached_property
+    def _outline(self) -> OutlineMesh:
+        """The part's mesh, prepared for its outline."""
+        assert self.part.mesh is not None  # a part without a mesh cannot be simulated
+        return make_outline_mesh(self.part.mesh.vertices, self.part.mesh.faces)
 
     def _trained_distance(self) -> tuple[float, float]:
         """Return the range of camera distances: 40 to 75 % of the network's range, metres."""
@@ -318,7 +328,8 @@ class Trials:
         poses = (align_with_bench(part.T_base_obj, hull, bench, low) for part in parts)
         flat = [replace(part, T_base_obj=pose) for part, pose in zip(parts, poses, strict=True)]
         planner = self._planner(scene)
-        choice = choose_part(planner, flat, self.part.points, self.grasps, joints, failed)
+        surface, unexplained = self.part.points, observation.unexplained
+        choice = choose_part(planner, flat, surface, self.grasps, joints, failed, unexplained)
         estimate = parts[choice.number if choice else 0].T_base_obj
         if choice is None:
             record = self._record(scene, source, observation, estimate, None)
@@ -352,22 +363,37 @@ class Trials:
             chances = [p.score if p.probability is None else p.probability for p in likely_parts]
             seen = [T_base_cam @ part.T_cam_obj for part in likely_parts]
             parts = [EstimatedPart(*pair) for pair in zip(seen, chances, strict=True)]
-            return SceneObservation(_by_height(parts), scene.joints)
+            unexplained = self._unexplained(scene.image, lens, T_base_cam, parts)
+            return SceneObservation(_by_height(parts), scene.joints, unexplained=unexplained)
         result = estimator.predict_views([scene.image], [lens], [T_base_cam])
         likely = self._likely(result.detections) or self._likely(result.weaker)[:1]
         likely.sort(key=lambda part: _height(part.T_world_obj), reverse=True)
-        assert estimator.refiner is not None
-        mesh = estimator.refiner.mesh(self.part.name)
-        assert mesh is not None
-        view = choose_viewpoint(self._planner(scene), lens.K, scene.joints, likely, mesh)
+        planner = self._planner(scene)
+        view = choose_viewpoint(planner, lens.K, scene.joints, likely, self._outline)
         joints, reason = (scene.joints, "none in reach") if view is None else view
+        image = scene.image
         if view is not None:
             image = scene.photograph(self._true_camera_pose(scene.robot, joints), rng)
             cameras = [T_base_cam, self._camera_pose(scene, source, joints)]
             result = estimator.predict_views([scene.image, image], [lens] * 2, cameras)
+            T_base_cam = cameras[1]
         likely = self._likely(result.detections)
         parts = [EstimatedPart(part.T_world_obj, part.probability) for part in likely]
-        return SceneObservation(_by_height(parts), joints, reason)
+        unexplained = self._unexplained(image, lens, T_base_cam, parts)
+        return SceneObservation(_by_height(parts), joints, reason, unexplained)
+
+    def _unexplained(
+        self, image: RGBImage, lens: Camera, T_base_cam: Transform, parts: Sequence[EstimatedPart]
+    ) -> Unexplained | None:
+        """Return the regions of a heap's image that probably show undetected parts."""
+        from dopepp.inference.network_input import prepare_image
+
+        if self.task.layout != "heap":
+            return None
+        T_cam_base = invert_transform(T_base_cam)
+        image, K, _ = prepare_image(image, lens.K, lens.coefficients)
+        poses = [T_cam_base @ part.T_base_obj for part in parts]
+        return Unexplained(find_unexplained(image, K, self._outline, poses), K, T_cam_base)
 
     def _likely(self, detections: Sequence[AnyDetection]) -> list[AnyDetection]:
         """Return the part's detections with at least half the score of its best detection."""

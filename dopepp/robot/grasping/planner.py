@@ -21,6 +21,7 @@ from dopepp.geometry.camera import Transform, make_transform, transform
 from dopepp.geometry.rotation import Vector, rotation_angle, rotation_vector_to_matrix
 from dopepp.robot.grasping.cell import FLANGE, HOME, JOINTS, Cell
 from dopepp.robot.grasping.grasps import ABOVE_BENCH, INSERTIONS, PAD_HALF, Grasp
+from dopepp.robot.grasping.unexplained import Unexplained
 from dopepp.virtual.body import Hull
 
 Joints = Float[np.ndarray, "6"]  # angles of the arm's joints, radians
@@ -189,9 +190,15 @@ class Planner:
         self._hand = np.array(["gripper/" in model.body(body).name for body in model.geom_bodyid])
 
     def plan(
-        self, poses: Sequence[Transform], grasps: Sequence[Grasp], start: Joints
+        self,
+        poses: Sequence[Transform],
+        grasps: Sequence[Grasp],
+        start: Joints,
+        unexplained: Unexplained | None = None,
     ) -> Plan | None:
         """Plan a motion from joint angles that grasps the first of several parts at T_base_obj.
+
+        The fingers do not descend into regions of ``unexplained``.
 
         Returns:
             The motion of the first grasp that is reachable, and with which the hand approaches,
@@ -200,6 +207,8 @@ class Planner:
         self._place(poses)
         for tilt, insertion, grasp in product(self._tilts, INSERTIONS, grasps):
             for tool, depth in self._tools(poses[0], grasp, tilt, insertion):
+                if unexplained is not None and unexplained.blocks(tool, grasp.opening):
+                    continue
                 motion = self._motion(poses[0], tool, grasp, start)
                 if motion is not None:
                     grip = max(SHALLOW, min(depth / INSERTIONS[1], 1.0))

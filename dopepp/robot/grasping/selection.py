@@ -27,6 +27,7 @@ from dopepp.robot.grasping.cell import TRAY
 from dopepp.robot.grasping.grasps import Grasp, Points
 from dopepp.robot.grasping.planner import Joints, Plan, Planner
 from dopepp.robot.grasping.rehearsal import SIZE, downward_view
+from dopepp.robot.grasping.unexplained import Unexplained
 
 BESIDE: Final = 0.003  # largest horizontal distance of a point above another point, metres
 ABOVE: Final = 0.002  # smallest height of a point above another point, metres
@@ -84,11 +85,13 @@ def choose_part(
     grasps: Sequence[Grasp],
     start: Joints,
     failed: Sequence[Transform] = (),
+    unexplained: Unexplained | None = None,
 ) -> Choice | None:
     """Return the part with the largest :func:`pick_score`, or None if no part can be grasped.
 
     ``points`` are the surface of each part, and ``grasps`` its grasps, the best first. ``failed``
-    are poses T_base_obj of parts that were not grasped in earlier attempts.
+    are poses T_base_obj of parts that were not grasped in earlier attempts. Grasps at
+    ``unexplained`` regions of the image are chosen only if there are no others.
     """
     poses = [part.T_base_obj for part in parts]
     orders = [[poses[k], *poses[:k], *poses[k + 1 :]] for k in range(len(parts))]  # first to grasp
@@ -103,9 +106,11 @@ def choose_part(
     for number in sorted(range(len(parts)), key=lambda number: -limits[number]):
         if limits[number] <= best_score:
             break  # not even a perfect grasp makes this part the best
-        plan = planner.plan(orders[number], grasps, start)
+        plan = planner.plan(orders[number], grasps, start, unexplained)
         if plan is not None and limits[number] * plan.quality > best_score:
             best, best_score = Choice(number, plan), limits[number] * plan.quality
+    if best is None and unexplained is not None:
+        return choose_part(planner, parts, points, grasps, start, failed)
     return best
 
 
