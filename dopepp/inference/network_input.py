@@ -230,7 +230,7 @@ def network_views(
     region = check_region(roi, image)
     if region is not None:
         x, y, columns, rows = region
-        image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
+        image = image[y : y + rows, x : x + columns]
         K = crop_camera(K, x, y)
     boxes = letterboxes(checkpoint, K, image, distances)
     return [
@@ -259,9 +259,10 @@ def resize_and_pad(
     image: RGBImage, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image, and pad it at the right and bottom to sides in multiples of ``multiple``."""
-    image = letterbox.image(image)
-    rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
-    return np.pad(image, ((0, rows), (0, columns), (0, 0)))
+    width, height = letterbox.width, letterbox.height
+    padded = np.zeros((height + -height % multiple, width + -width % multiple, 3), np.uint8)
+    padded[:height, :width] = letterbox.image(image)
+    return padded
 
 
 def letterboxes(
@@ -269,9 +270,11 @@ def letterboxes(
 ) -> list[Letterbox]:
     """Return the sizes of an image on which the network runs, the smallest first.
 
-    By default, one group of sizes shows parts at the training distances. A further size is that of
-    training images, for parts that fill the image. Both are equal for the training camera. For a
-    checkpoint that records no training distances, only the size of training images is used.
+    By default, a group of sizes shows the parts at the training distances. With a longer focal
+    length than in training, a farther part fills the same share of the image. The network therefore
+    also runs on the size of training images if this size is larger than the group. If it is
+    smaller, only parts nearer than in training would have a trained size. For a checkpoint that
+    records no training distances, only the size of training images is used.
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -280,7 +283,7 @@ def letterboxes(
         if part.name in checkpoint.seen:
             seen, reach = checkpoint.seen[part.name], part.diameter * focal_length(K)
             scales += _scales(seen, reach, _depths(seen, reach, size, distances))
-    if not scales or distances is None:
+    if not scales or (distances is None and learned.scale_x > max(scales)):
         scales.append(learned.scale_x)
     boxes: list[Letterbox] = []
     for scale in sorted(scales):

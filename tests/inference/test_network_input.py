@@ -62,10 +62,28 @@ def test_training_camera_uses_the_training_size():
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (2592, 1944)])
 def test_camera_with_more_pixels_shows_the_part_at_the_trained_size(size):
     focal = 120.0 * min(size) / 128
-    training, box = boxes(size, focal)
-    assert training == Letterbox.fit(size, (128, 128))
+    (box,) = boxes(size, focal)
     assert min(box.width, box.height) == pytest.approx(128, rel=0.03)
     assert box.width / box.height == pytest.approx(size[0] / size[1], rel=0.02)
+
+
+def test_longer_focal_length_adds_the_size_of_training_images():
+    training = Letterbox.fit((640, 480), (128, 128))
+    (trained_distances,) = boxes((640, 480), 450.0)
+    assert trained_distances.scale_x > training.scale_x
+    trained_distances, whole = boxes((640, 480), 1200.0)
+    assert trained_distances.scale_x < whole.scale_x
+    assert whole == training
+    (near_range,) = boxes((640, 480), 1200.0, (0.12, 0.25))
+    assert near_range == trained_distances
+
+
+def test_a_window_of_a_camera_does_not_add_a_size():
+    """The training windows of a camera are smaller than its scaled image."""
+    seen = LearnedRange(45.0, 120.0, 0.3, 0.8)
+    focal = 600.0
+    (box,) = boxes((640, 480), focal, seen=seen)
+    assert box.scale_x == pytest.approx(45.0 * 0.8 / (0.1 * focal), rel=1e-2)
 
 
 def test_checkpoint_without_trained_sizes_uses_its_input_size():
