@@ -63,7 +63,9 @@ def measure(
             errors = pose_errors(detection.T_cam_obj, true, part.points)
             passed += errors.add < 100 * part.diameter
             turns.append(errors.rotation)
-    boxes = letterboxes(estimator.checkpoint, scenes[0].K, image, distances)
+    boxes = letterboxes(
+        estimator.checkpoint, estimator.network.size_multiple, image, scenes[0].K, distances
+    )
     sizes = ", ".join(f"{box.width}×{box.height}" for box in boxes)
     turn = f"{statistics.median(turns):.1f}" if turns else "–"
     rates = [f"{passed / len(scenes):.1%}", turn, f"{missed / len(scenes):.1%}"]

@@ -50,7 +50,7 @@ def checkpoint(diameter=0.1, seen=SEEN, **others):
 
 def boxes(size, focal, distances=None, **options):
     K = camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
-    return letterboxes(checkpoint(**options), K, blank_image(*size), distances)
+    return letterboxes(checkpoint(**options), 32, blank_image(*size), K, distances)
 
 
 def test_training_camera_uses_the_training_size():
@@ -63,8 +63,21 @@ def test_training_camera_uses_the_training_size():
 def test_camera_with_more_pixels_shows_the_part_at_the_trained_size(size):
     focal = 120.0 * min(size) / 128
     (box,) = boxes(size, focal)
-    assert min(box.width, box.height) == pytest.approx(128, rel=0.03)
+    assert 128 / MARGIN <= min(box.width, box.height) <= 1.03 * 128
     assert box.width / box.height == pytest.approx(size[0] / size[1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("size", "focal", "expected"),
+    [
+        ((640, 480), 450.0, (160, 120)),  # 169×127, reduced by 5 %: 160×128 instead of 192×128
+        ((640, 480), 400.0, (190, 143)),  # 160 would be more than 10 % smaller
+        ((384, 288), 198.0, (384, 288)),  # no padding at the right
+    ],
+)
+def test_an_image_is_a_little_smaller_if_that_saves_padding(size, focal, expected):
+    *_, box = boxes(size, focal)
+    assert (box.width, box.height) == expected
 
 
 def test_longer_focal_length_adds_the_size_of_training_images():

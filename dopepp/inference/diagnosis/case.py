@@ -135,7 +135,8 @@ class Case:
         """Resizing that shows the part closest to its trained size; for templates, at full size."""
         if not self.estimator.has_network:
             return Letterbox.scaled(self.image.shape[1::-1], 1.0)
-        boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
+        network = self.estimator.checkpoint, self.estimator.network.size_multiple
+        boxes = letterboxes(*network, self.image, self.K, self.distances)
         if self.detection is None or self.seen is None:
             return boxes[-1]
         typical_px = math.sqrt(self.seen.smallest_px * self.seen.largest_px)
