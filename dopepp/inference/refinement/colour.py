@@ -297,7 +297,7 @@ def _sums(first: Array, second: Array) -> tuple[Scalar, Scalar]:
 
 @compiled()
 def _blur(counts: Array) -> None:
-    """Blur a histogram by (1, 2, 1)/4 along all three channels; most lines are empty and stay so."""
+    """Blur a histogram by (1, 2, 1)/4 along all three channels; empty lines remain empty."""
     plane = STEPS * STEPS
     sums = np.zeros(plane, np.float32)  # of the lines along the first channel
     for a in range(STEPS):
