@@ -19,7 +19,7 @@ from common import pose_errors, print_head, print_row, use_one_thread
 
 from dopepp.geometry.camera import resize_camera
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.network_input import Distances, letterboxes
+from dopepp.inference.network_input import Distances
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory, Scene, render
 from dopepp.virtual.sensor import capture
@@ -62,7 +62,7 @@ def measure(
             errors = pose_errors(detection.T_cam_obj, true, part.points)
             passed += errors.add < 100 * part.diameter
             turns.append(errors.rotation)
-    boxes = letterboxes(estimator.checkpoint, scenes[0].K, image, distances)
+    boxes = [view.box for view in estimator.views(image, scenes[0].K, distances)]
     sizes = ", ".join(f"{box.width}×{box.height}" for box in boxes)
     turn = f"{statistics.median(turns):.1f}" if turns else "–"
     rates = [f"{passed / len(scenes):.1%}", turn, f"{missed / len(scenes):.1%}"]

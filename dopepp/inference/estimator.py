@@ -294,8 +294,13 @@ class PoseEstimator:
         stride, options = self.network.stride, self._recovery_options(0.0)
         scales: list[list[Detection]] = []
         for view in views:
+            # A second view hardly improves a probable detection, and doubles the time.
+            if view.is_further and self._detects_all_parts(scales):
+                continue
+            with self.timed("pre"):
+                pixels = view.pixels
             with self.timed("network"):
-                belief, field = self.maps(view.pixels)
+                belief, field = self.maps(pixels)
             with self.timed("decode"):
                 detections = recover(
                     belief, field, self.cuboids, view.K, stride, self._names,
@@ -305,6 +310,11 @@ class PoseEstimator:
                 [view.to_image(item, self._cuboid_of[item.object], K) for item in detections]
             )
         return merge_scales(scales)
+
+    def _detects_all_parts(self, scales: Sequence[Sequence[Detection]]) -> bool:
+        """Return whether each part has a probable detection."""
+        probable = (item.object for group in scales for item in group if item.score >= PROBABLE)
+        return set(self._names) <= set(probable)
 
     def _searched_depths(self, view: NetworkView) -> list[tuple[float, float] | None] | None:
         """Return the depths at which :func:`recover` searches each part, metres.

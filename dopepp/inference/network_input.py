@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -182,10 +183,17 @@ def undistort_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -
 class NetworkView:
     """Region of an image in one of the sizes that the network is run on."""
 
-    pixels: UInt8[np.ndarray, "rows columns 3"]  # resized, padded at the right and bottom
+    region: RGBImage  # pixels of the image
     box: Letterbox  # resizing of the region
     K: CameraMatrix  # camera matrix of ``pixels``
     corner: tuple[int, int]  # x and y of the region in the image, pixels
+    multiple: int  # the sides are padded to multiples of this number
+    is_further: bool = False  # for parts that the other views do not show at a trained size
+
+    @cached_property
+    def pixels(self) -> UInt8[np.ndarray, "rows columns 3"]:
+        """Resized region, padded at the right and bottom; computed on first use."""
+        return resize_and_pad(self.region, self.box, self.multiple)
 
     def to_image(self, detection: Detection, cuboid: Cuboid, K: CameraMatrix) -> Detection:
         """Express a detection in pixels of the whole image, whose camera matrix is K."""
@@ -217,7 +225,10 @@ def network_views(
     distances: Distances | None = None,
     roi: Region | None = None,
 ) -> list[NetworkView]:
-    """Scale and pad an image to the inputs on which the network runs, the smallest first.
+    """Scale and pad an image to the inputs on which the network runs.
+
+    Views of the expected distances come first, the smallest first. By default, a further view has
+    the size of training images, unless it shows no trained part at a trained size.
 
     Args:
         checkpoint: Checkpoint of the network.
@@ -235,13 +246,14 @@ def network_views(
     region = check_region(roi, image)
     if region is not None:
         x, y, columns, rows = region
-        image = np.ascontiguousarray(image[y : y + rows, x : x + columns])
+        image = image[y : y + rows, x : x + columns]
         K = crop_camera(K, x, y)
-    boxes = letterboxes(checkpoint, K, image, distances)
-    return [
-        NetworkView(resize_and_pad(image, box, multiple), box, box.camera(K), (x, y))
-        for box in boxes
-    ]
+    boxes = letterboxes(checkpoint, multiple, image, K, distances)
+    views = [NetworkView(image, box, box.camera(K), (x, y), multiple) for box in boxes]
+    further = _further_letterbox(checkpoint, image, K, boxes) if distances is None else None
+    if further is not None:
+        views.append(NetworkView(image, further, further.camera(K), (x, y), multiple, True))
+    return views
 
 
 def check_region(roi: Region | None, image: RGBImage) -> Region | None:
@@ -264,26 +276,24 @@ def resize_and_pad(
     image: RGBImage, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image, and pad it at the right and bottom to sides in multiples of ``multiple``."""
-    image = letterbox.image(image)
-    rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
-    return np.pad(image, ((0, rows), (0, columns), (0, 0)))
+    width, height = letterbox.width, letterbox.height
+    padded = np.zeros((height + -height % multiple, width + -width % multiple, 3), np.uint8)
+    padded[:height, :width] = letterbox.image(image)
+    return padded
 
 
 def letterboxes(
-    checkpoint: Checkpoint, K: CameraMatrix, image: RGBImage, distances: Distances | None = None
+    checkpoint: Checkpoint,
+    multiple: int,
+    image: RGBImage,
+    K: CameraMatrix,
+    distances: Distances | None = None,
 ) -> list[Letterbox]:
     """Return the sizes of an image on which the network runs, the smallest first.
 
-    One group of sizes shows parts at the expected distances as large as in training. By default,
-    the size of training images is added, for parts that fill the image. For the training camera,
-    both are equal. For a checkpoint that records no training distances, only the size of training
-    images is used.
-
-    Args:
-        checkpoint: Checkpoint of the network.
-        K: Camera matrix of the image, pixels.
-        image: Image, of which only the size is used.
-        distances: Nearest and farthest expected depth, metres (default: the training distances).
+    The sizes show the parts at the expected distances as large as in training. For a checkpoint
+    that records no training distances, only the size of training images is used. See
+    :func:`network_views` for the arguments.
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -292,7 +302,7 @@ def letterboxes(
         if part.name in checkpoint.seen:
             seen, reach = checkpoint.seen[part.name], part.diameter * focal_length(K)
             scales += _scales(seen, reach, _depths(seen, reach, size, distances))
-    if not scales or distances is None:
+    if not scales:
         scales.append(learned.scale_x)
     boxes: list[Letterbox] = []
     for scale in sorted(scales):
@@ -300,9 +310,30 @@ def letterboxes(
             continue
         # For the training camera, use exactly the size of training images.
         is_trained_size = 1 / MARGIN < scale / learned.scale_x < MARGIN
-        boxes.append(learned if is_trained_size else Letterbox.scaled(size, scale))
+        boxes.append(learned if is_trained_size else _with_less_padding(size, scale, multiple))
     fitting = [box for box in boxes if box.width * box.height <= MAX_PIXELS]
     return fitting or [Letterbox.scaled(size, math.sqrt(MAX_PIXELS / (size[0] * size[1])))]
+
+
+def _further_letterbox(
+    checkpoint: Checkpoint, image: RGBImage, K: CameraMatrix, boxes: Sequence[Letterbox]
+) -> Letterbox | None:
+    """Return the size of training images; None if it shows nothing that ``boxes`` do not show.
+
+    With a longer focal length than in training, it shows farther parts at a trained size, and with
+    a shorter focal length or a wider image nearer parts. The windows that a network was trained on
+    are often much smaller than the image. At their size, even the nearest part is too small.
+    """
+    learned = Letterbox.fit((image.shape[1], image.shape[0]), checkpoint.input_size)
+    is_shown = any(1 / MARGIN < box.scale_x / learned.scale_x < MARGIN for box in boxes)
+    if is_shown or learned.width * learned.height > MAX_PIXELS:
+        return None
+    reach = learned.scale_x * focal_length(K)
+    for part in checkpoint.parts:
+        seen = checkpoint.seen.get(part.name)
+        if seen is None or reach * part.diameter / seen.nearest >= seen.smallest_px:
+            return learned
+    return None
 
 
 def merge_scales(scales: Sequence[Sequence[Detection]]) -> list[Detection]:
@@ -359,6 +390,19 @@ def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Se
     middles = near * (far / near) ** ((np.arange(count) + 0.5) / count)
     scales: list[float] = (math.sqrt(seen.smallest_px * seen.largest_px) * middles / reach).tolist()
     return scales
+
+
+def _with_less_padding(size: Size, scale: float, multiple: int) -> Letterbox:
+    """Return the size of an image at a scale, reduced by up to ``MARGIN`` if this saves padding."""
+    box = Letterbox.scaled(size, scale)
+    boxes = [box]
+    for side, whole in ((box.width, size[0]), (box.height, size[1])):
+        unpadded = side // multiple * multiple
+        if MARGIN * unpadded >= side:
+            boxes.append(Letterbox.scaled(size, unpadded / whole))
+    return min(
+        boxes, key=lambda box: math.ceil(box.width / multiple) * math.ceil(box.height / multiple)
+    )
 
 
 def are_same(first: Detection, second: Detection) -> bool:

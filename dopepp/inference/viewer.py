@@ -187,7 +187,7 @@ def belief_images(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, 
     """
     if not estimator.has_network:
         return {}
-    view = estimator.views(result.image, result.K)[-1]
+    view = max(estimator.views(result.image, result.K), key=lambda view: view.box.scale_x)
     beliefs = estimator.maps(view.pixels)[0].cpu().numpy()
     by_part = beliefs.reshape(len(estimator.parts), CENTROID + 1, *beliefs.shape[1:])
     levels = np.rint(255 * by_part.max(axis=1).clip(0, 1)).astype(np.uint8)

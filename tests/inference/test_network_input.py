@@ -50,7 +50,7 @@ def checkpoint(diameter=0.1, seen=SEEN, **others):
 
 def boxes(size, focal, distances=None, **options):
     K = camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
-    return letterboxes(checkpoint(**options), K, blank_image(*size), distances)
+    return letterboxes(checkpoint(**options), 32, blank_image(*size), K, distances)
 
 
 def test_training_camera_uses_the_training_size():
@@ -62,10 +62,44 @@ def test_training_camera_uses_the_training_size():
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (2592, 1944)])
 def test_camera_with_more_pixels_shows_the_part_at_the_trained_size(size):
     focal = 120.0 * min(size) / 128
-    training, box = boxes(size, focal)
-    assert training == Letterbox.fit(size, (128, 128))
-    assert min(box.width, box.height) == pytest.approx(128, rel=0.03)
+    (box,) = boxes(size, focal)
+    assert 128 / MARGIN <= min(box.width, box.height) <= 1.03 * 128
     assert box.width / box.height == pytest.approx(size[0] / size[1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("size", "focal", "expected"),
+    [
+        ((640, 480), 450.0, (160, 120)),  # 169×127, reduced by 5 %: 160×128 instead of 192×128
+        ((640, 480), 400.0, (190, 143)),  # 160 would be more than 10 % smaller
+        ((192, 160), 118.8, (192, 160)),  # without padding
+    ],
+)
+def test_an_image_is_a_little_smaller_if_that_saves_padding(size, focal, expected):
+    *_, box = boxes(size, focal)
+    assert (box.width, box.height) == expected
+
+
+@pytest.mark.parametrize("focal", [450.0, 1200.0])
+def test_the_size_of_training_images_is_a_further_view(focal):
+    """With the longer focal length, it shows farther parts; with the shorter, nearer parts."""
+    K, image = camera_matrix(focal, focal, 320, 240), blank_image(640, 480)
+    expected, further = network_views(checkpoint(), 32, image, K)
+    assert not expected.is_further
+    assert further.is_further
+    assert further.box == Letterbox.fit((640, 480), (128, 128))
+    (stated,) = network_views(checkpoint(), 32, image, K, (0.12, 0.25))
+    assert stated.box == expected.box
+
+
+def test_windows_of_a_camera_are_no_further_view():
+    """The whole image at the size of the training windows shows no part at a trained size."""
+    seen, focal = LearnedRange(45.0, 120.0, 0.3, 0.8), 600.0
+    K = camera_matrix(focal, focal, 320, 240)
+    (view,) = network_views(checkpoint(seen=seen), 32, blank_image(640, 480), K)
+    assert view.box.scale_x == pytest.approx(45.0 * 0.8 / (0.1 * focal), rel=1e-2)
+    nearest_px = 128 / 640 * 0.1 * focal / seen.nearest
+    assert nearest_px < seen.smallest_px
 
 
 def test_checkpoint_without_trained_sizes_uses_its_input_size():
@@ -150,6 +184,21 @@ def test_other_cameras_detect_as_many_parts_as_the_training_camera(estimator, sc
     usual = num_right(estimator, scenes)
     assert usual >= 5
     assert num_right(estimator, [with_image_size(scene, size) for scene in scenes]) >= usual - 2
+
+
+def test_a_further_view_is_left_out_after_a_probable_detection(estimator, scenes, monkeypatch):
+    scene, sizes = with_image_size(scenes[0], (640, 480)), []
+    compute = estimator.maps
+
+    def maps(pixels):
+        sizes.append(pixels.shape[:2])
+        return compute(pixels)
+
+    monkeypatch.setattr(estimator, "maps", maps)
+    assert estimator.predict(render(scene).image, scene.K)[0].score > 0.5
+    assert sizes == [(128, 160)]
+    estimator.predict(blank_image(640, 480), scene.K)
+    assert sizes[1:] == [(128, 160), (96, 128)]
 
 
 def test_farther_part_is_detected_with_a_farther_range(estimator, scenes):

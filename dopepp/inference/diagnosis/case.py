@@ -15,7 +15,6 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.network_input import letterboxes
 from dopepp.parts.part import Part
 from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import Detection
@@ -131,9 +130,9 @@ class Case:
         """Resizing that shows the part closest to its trained size; for templates, at full size."""
         if not self.estimator.has_network:
             return Letterbox.scaled(self.image.shape[1::-1], 1.0)
-        boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
+        boxes = [view.box for view in self.estimator.views(self.image, self.K, self.distances)]
         if self.detection is None or self.seen is None:
-            return boxes[-1]
+            return max(boxes, key=lambda box: box.scale_x)
         typical_px = math.sqrt(self.seen.smallest_px * self.seen.largest_px)
         return min(boxes, key=lambda box: abs(math.log(self.length_px * box.scale_x / typical_px)))
 

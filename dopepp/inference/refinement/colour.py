@@ -41,21 +41,36 @@ FEWEST: Final = 60  # smallest number of pixels of a histogram
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A part and its surroundings, cut from an image and shrunk."""
+    """A part and its surroundings, cut from an image and shrunk.
 
-    colours: RGBImage
+    Colours are computed on first use, because a refinement round may be skipped.
+    """
+
+    region: RGBImage  # pixels of the image; the sides are multiples of `factor`
+    factor: int  # image pixels per crop pixel
     K: CameraMatrix  # camera matrix of the crop, pixels
     extent: float  # longer side of the part, pixels of the crop
-    scale: float  # crop pixels per image pixel: 1/n for an integer n
+
+    @property
+    def scale(self) -> float:
+        """Crop pixels per image pixel."""
+        return 1 / self.factor
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height, pixels."""
-        return self.colours.shape[1], self.colours.shape[0]
+        return self.region.shape[1] // self.factor, self.region.shape[0] // self.factor
+
+    @cached_property
+    def colours(self) -> RGBImage:
+        """RGB pixels of the crop."""
+        if self.factor == 1:
+            return self.region.copy()  # contiguous like a resized crop: kernels are compiled once
+        return np.asarray(cv2.resize(self.region, self.size, interpolation=cv2.INTER_AREA))
 
     @cached_property
     def bins(self) -> Int[np.ndarray, "height width"]:
-        """Colour bin of each pixel, computed on first use, as a refinement round may be skipped."""
+        """Colour bin of each pixel."""
         return colour_bins(self.colours)
 
 
@@ -90,14 +105,11 @@ def crop_around(
     most = min(right - left, bottom - top) // SMALLEST_PX
     factor = min(max(1, round(extent / longest_px)), most)
     width, height = (right - left) // factor, (bottom - top) // factor
-    colours = image[top : top + factor * height, left : left + factor * width]
+    region = image[top : top + factor * height, left : left + factor * width]
     K = crop_camera(K, left, top)
-    if factor == 1:
-        colours = colours.copy()  # contiguous like a resized crop: kernels are compiled once
-    else:
+    if factor > 1:
         K = resize_camera(K, 1 / factor, 1 / factor)
-        colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
-    return Crop(colours, K, extent / factor, 1 / factor)
+    return Crop(region, factor, K, extent / factor)
 
 
 def colour_bins(image: RGBImage) -> Int[np.ndarray, "height width"]:
@@ -230,7 +242,9 @@ def _tables(counts: Array, tables: Array) -> None:
                 _blur(counts[side, i, j])
                 for k in range(STEPS**3):
                     total[side, k] += counts[side, i, j, k]
-        factor = KNOWN / _sum(total[side])
+    sums = _sums(total[0], total[1])
+    for side in range(2):
+        factor = KNOWN / sums[side]
         for k in range(STEPS**3):
             total[side, k] *= factor
     for i in range(tiles):
@@ -243,8 +257,13 @@ def _tables(counts: Array, tables: Array) -> None:
                         share = np.float32(0.5 ** (abs(a - i) + abs(b - j)))
                         for k in range(STEPS**3):
                             near[side, k] += share * counts[side, a, b, k]
-            level = math.log(_sum(near[1]) / _sum(near[0]))
+            inside, outside = _sums(near[0], near[1])
+            level = math.log(outside / inside)
             for k in range(STEPS**3):
+                # Most colours have not been counted, and have the value of their neighbour.
+                if k > 0 and near[0, k] == near[0, k - 1] and near[1, k] == near[1, k - 1]:
+                    tables[i, j, k] = tables[i, j, k - 1]
+                    continue
                 odds = level + math.log(near[0, k] / near[1, k])
                 tables[i, j, k] = min(max(odds, -MOST), MOST)
 
@@ -261,30 +280,41 @@ def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Arra
         odds: Filled with the log odds, shape (height, width).
     """
     for v in range(bins.shape[0]):
+        tables_of_row = tables[rows[v]]
         for u in range(bins.shape[1]):
-            odds[v, u] = tables[rows[v], columns[u], bins[v, u]]
+            odds[v, u] = tables_of_row[columns[u], bins[v, u]]
 
 
 @compiled()
-def _sum(row: Array) -> Scalar:
-    """Return the sum of a row in float32."""
-    total = np.float32(0.0)
-    for k in range(len(row)):
-        total += row[k]
-    return total
+def _sums(first: Array, second: Array) -> tuple[Scalar, Scalar]:
+    """Return the sums of two rows in float32; one loop for both takes the time of one sum."""
+    total, other = np.float32(0.0), np.float32(0.0)
+    for k in range(len(first)):
+        total += first[k]
+        other += second[k]
+    return total, other
 
 
 @compiled()
 def _blur(counts: Array) -> None:
-    """Blur a histogram by (1, 2, 1)/4 along all three channels."""
+    """Blur a histogram by (1, 2, 1)/4 along all three channels; empty lines remain empty."""
+    plane = STEPS * STEPS
+    sums = np.zeros(plane, np.float32)  # of the lines along the first channel
     for a in range(STEPS):
+        is_empty = True
+        for k in range(plane):
+            is_empty &= counts[a * plane + k] == 0.0
+        if is_empty:
+            continue
         for b in range(STEPS):
-            rows = (((a * STEPS + b) * STEPS, 1), (a * STEPS * STEPS + b, STEPS))
+            rows = ((a * plane + b * STEPS, 1), (a * plane + b, STEPS))
             for first, stride in rows:  # numba would compile a call for each constant stride
                 _blur_row(counts, first, stride)
-    for a in range(STEPS):
-        for b in range(STEPS):
-            _blur_row(counts, a * STEPS + b, STEPS * STEPS)
+        for k in range(plane):
+            sums[k] += counts[a * plane + k]
+    for k in range(plane):
+        if sums[k] > 0.0:
+            _blur_row(counts, k, plane)
 
 
 @compiled()

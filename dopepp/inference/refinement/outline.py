@@ -118,8 +118,8 @@ def filled_mask(
 ) -> UInt8[np.ndarray, "height width"]:
     """Return a mask of size (width, height): 1 if the mesh covers the pixel's centre, else 0."""
     width, height = size
-    mask = np.empty((height, width), np.uint8)
-    winding = np.zeros((1 if mesh.is_closed else 2, height, width + 1), np.int32)
+    mask = np.zeros((height, width), np.uint8)
+    winding = np.empty((1 if mesh.is_closed else 2, height, width + 1), np.int32)
     pixels, front = posed_mesh.pixels, posed_mesh.front
     pairs = mesh.edges, mesh.sides, mesh.paired
     _wind(pixels, front, *pairs, mesh.loose_edges, mesh.loose_sides, winding, mask)
@@ -227,11 +227,25 @@ def _wind(
         paired: 1 for edges with exactly two triangles, which are oriented alike.
         loose_edges: Vertices of each loose edge, in the direction of its triangle.
         loose_sides: Triangle of each loose edge.
-        winding: Zeros; filled with the winding number's changes along each row, for the triangles
-            that face the camera and, in an open mesh, for those that face away.
-        mask: Filled with 1 inside the borders and 0 outside.
+        winding: Filled, in the box of the vertices, with the winding number's changes along each
+            row, for the triangles that face the camera and, in an open mesh, for those that face
+            away.
+        mask: Zeros; set to 1 inside the borders.
     """
     height, width = mask.shape
+    low_x, low_y, high_x, high_y = width - 0.0, height - 0.0, 0.0, -1.0
+    for i in range(len(pixels)):
+        low_x, high_x = min(low_x, pixels[i, 0]), max(high_x, pixels[i, 0])
+        low_y, high_y = min(low_y, pixels[i, 1]), max(high_y, pixels[i, 1])
+    top, bottom = int(max(0.0, math.floor(low_y))), int(min(math.ceil(high_y), height - 1.0)) + 1
+    # A crossing at the right end may be rounded up to the next column.
+    left, right = int(max(0.0, math.floor(low_x))), int(min(math.ceil(high_x) + 1.0, width))
+    # Views start at index 0, for which numba vectorises loops.
+    changes, inside = winding[:, top:bottom, left : right + 1], mask[top:bottom, left:right]
+    for side in range(changes.shape[0]):
+        for v in range(changes.shape[1]):
+            for u in range(changes.shape[2]):
+                changes[side, v, u] = 0
     for e in range(len(edges)):
         first, second = sides[e, 0], sides[e, 1]
         if not paired[e] or front[first] == front[second]:
@@ -247,15 +261,13 @@ def _wind(
             _cross_rows(pixels, i, j, winding[0])
         else:
             _cross_rows(pixels, j, i, winding[1])
-    for v in range(height):
-        for u in range(width):
-            mask[v, u] = 0
-        for side in range(len(winding)):
+    for v in range(inside.shape[0]):
+        for side in range(changes.shape[0]):
             count = 0
-            for u in range(width):
-                count += winding[side, v, u]
+            for u in range(inside.shape[1]):
+                count += changes[side, v, u]
                 if count != 0:
-                    mask[v, u] = 1
+                    inside[v, u] = 1
 
 
 @compiled()
@@ -357,11 +369,13 @@ def _outward(
         return False
     # The mean of the filled pixels in the disc lies on the inside of the border.
     x = y = 0.0
-    for row in range(math.ceil(v - WINDOW_PX), math.floor(v + WINDOW_PX) + 1):
-        for column in range(math.ceil(u - WINDOW_PX), math.floor(u + WINDOW_PX) + 1):
-            a, b = column - u, row - v
-            inside = 0 <= row < height and 0 <= column < width and mask[row, column] == 1
-            if a * a + b * b <= WINDOW_PX**2 and inside:
+    top, bottom = max(0, math.ceil(v - WINDOW_PX)), min(height - 1, math.floor(v + WINDOW_PX))
+    left, right = max(0, math.ceil(u - WINDOW_PX)), min(width - 1, math.floor(u + WINDOW_PX))
+    for row in range(top, bottom + 1):
+        b = row - v
+        for column in range(left, right + 1):
+            a = column - u
+            if mask[row, column] == 1 and a * a + b * b <= WINDOW_PX**2:
                 x, y = x - a, y - b
     size = math.hypot(x, y)
     if size == 0.0:

@@ -74,7 +74,7 @@ def region_terms(
     _terms(rows, shifts.mean, shifts.information, *prior, independent, alike, H, g)
     # The Schur complement eliminates the offset.
     last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
-    H, g = H[:6, :6] - np.outer(last, H[:6, 6]), g[:6] - last * g[6]
+    H, g = H[:6, :6] - last[:, None] * H[:6, 6], g[:6] - last * g[6]
     _eliminate_scale(H, g, *prior, position, max(scale_error, 1e-9))
     return H, g
 
