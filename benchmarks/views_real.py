@@ -132,7 +132,7 @@ class DrawnEstimator:
         keypoints = project_keypoints(part.cuboid, T, K)
         return [Detection(part.name, 0.5, 0.5, T, keypoints, nothing, 0.0, self.covariance)], []
 
-    def verified(
+    def candidates_from(
         self, starts: list[Detection], image: np.ndarray, K: np.ndarray, *_: object
     ) -> list[Detection]:
         """Return the refined detections of an image."""

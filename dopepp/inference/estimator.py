@@ -287,7 +287,8 @@ class PoseEstimator:
         with a network score below :data:`~dopepp.recovery.detection.CANDIDATE` are left out.
         """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
-        return self.verified(self.start_detections(image, K, distances, roi)[0], image, K, depth)
+        starts, _ = self.start_detections(image, K, distances, roi)
+        return self.candidates_from(starts, image, K, depth)
 
     def start_detections(
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
@@ -312,18 +313,18 @@ class PoseEstimator:
             seen.append(SeenMaps(view.K, belief, depths))
         return merge_scales(scales), seen
 
-    def verified(
+    def candidates_from(
         self,
-        detections: Sequence[Detection],
+        starts: Sequence[Detection],
         image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None = None,
     ) -> list[Detection]:
-        """Return detections after refinement, with the scores of refined poses, best first."""
+        """Return start detections after refinement, with scores of refined poses, best first."""
         if self.refiner is None:
-            return list(detections)
+            return list(starts)
         by_depth = depth is not None and self.refiner.uses_depth
-        return self._recalibrated(self.refined(detections, image, K, depth), by_depth)
+        return self._recalibrated(self.refined(starts, image, K, depth), by_depth)
 
     def _searched_depths(self, view: NetworkView) -> list[tuple[float, float] | None] | None:
         """Return the depths in which poses of each part are searched; None without verification."""

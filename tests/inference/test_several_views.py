@@ -180,10 +180,10 @@ def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views):
 def test_unrefined_detection_does_not_overrule_the_other_views(
     estimator, scene, views, true, monkeypatch
 ):
-    verified, calls = estimator.verified, []
+    candidates_from, calls = estimator.candidates_from, []
 
     def with_a_wrong_second_view(*given):
-        detections = verified(*given)
+        detections = candidates_from(*given)
         calls.append(len(detections))
         if len(calls) < 2:
             return detections
@@ -195,7 +195,7 @@ def test_unrefined_detection_does_not_overrule_the_other_views(
         }  # fmt: skip
         return [replace(detections[0], **unrefined)]
 
-    monkeypatch.setattr(estimator, "verified", with_a_wrong_second_view)
+    monkeypatch.setattr(estimator, "candidates_from", with_a_wrong_second_view)
     result = predicted(estimator, scene, views)
     assert len(calls) == 2
     (detection,) = result.detections
@@ -208,12 +208,12 @@ def test_wrong_poses_are_replaced_by_a_search_in_all_views(
     estimator, scene, views, true, monkeypatch
 ):
     """Both detections have a wrong rotation, and only their centroids are right."""
-    verified, cuboid = estimator.verified, estimator.cuboids[0]
+    candidates_from, cuboid = estimator.candidates_from, estimator.cuboids[0]
     turn = rotation_vector_to_matrix(np.array([0.0, 2.0, 0.0]))
     wrong_poses = []
 
     def turned(*given):
-        detection = verified(*given)[0]
+        detection = candidates_from(*given)[0]
         T = detection.T_cam_obj
         centroid = T[:3, :3] @ cuboid[CENTROID] + T[:3, 3]
         rotation = T[:3, :3] @ turn
@@ -221,7 +221,7 @@ def test_wrong_poses_are_replaced_by_a_search_in_all_views(
         wrong_poses.append(wrong)
         return [replace(detection, T_cam_obj=wrong, score=0.01, probability=0.01)]
 
-    monkeypatch.setattr(estimator, "verified", turned)
+    monkeypatch.setattr(estimator, "candidates_from", turned)
     result = predicted(estimator, scene, views)
     (detection,) = result.detections
     assert len(wrong_poses) == 2

@@ -105,8 +105,8 @@ def search(
     observations, maps = _observations(estimator, joint.views, distances, regions)
     associated, least = partial(associate, geometries=joint.geometries), estimator.min_score
     with estimator.timed("refine"):
-        clusters, search = associated(observations), JointSearch(estimator, joint.views, maps)
-        parts = [part.detection for part in joint.parts(clusters, search)]
+        in_maps = JointSearch(estimator, joint.views, maps)
+        parts = [part.detection for part in joint.parts(associated(observations), in_maps)]
     strong = [[item for item in view if item.detection.score >= least] for view in observations]
     passed, findings = contradictions(
         [part for part in parts if part.score >= least],
@@ -202,7 +202,7 @@ def _observations(
         starts, seen = list[Detection](), list[SeenMaps]()
         if regions is None or region is not None:
             starts, seen = estimator.start_detections(view.image, view.K, distances, region)
-        candidates = estimator.verified(starts, view.image, view.K, view.depth)
+        candidates = estimator.candidates_from(starts, view.image, view.K, view.depth)
         observations.append([make_observation(number, candidate, view) for candidate in candidates])
         maps.append(seen)
     return observations, maps
