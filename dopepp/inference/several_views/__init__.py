@@ -199,7 +199,8 @@ def _observations(
     maps: list[list[SeenMaps]] = []
     for number, view in enumerate(views):
         region = None if regions is None else regions[number]
-        starts, seen = list[Detection](), list[SeenMaps]()
+        starts: list[Detection] = []
+        seen: list[SeenMaps] = []
         if regions is None or region is not None:
             starts, seen = estimator.start_detections(view.image, view.K, distances, region)
         candidates = estimator.candidates_from(starts, view.image, view.K, view.depth)
