@@ -96,7 +96,8 @@ class JointEstimator:
         """Estimate one part per cluster of observations, drop duplicates, and sort by score.
 
         Each observation that disagrees with its cluster's joint pose becomes a separate cluster.
-        Where no pose is probable, ``search`` returns another start.
+        Where no pose is probable, ``search`` returns another start. Its result is used if it is
+        probable and at least two views show the part.
 
         Args:
             clusters: Observations of each possible part, best first; the best cluster first.
@@ -112,7 +113,7 @@ class JointEstimator:
             if is_doubtful and not any(_is_at(found, cluster[0]) for found in parts):
                 searched = search(cluster[0])
                 other = part if searched is None else self.estimate([searched])
-                if other.detection.probability >= PROBABLE:
+                if other.detection.probability >= PROBABLE and len(other.detection.views) > 1:
                     part = other
                     waiting = [rest for rest in waiting if not _is_at(part, rest[0])]
             parts.append(part)

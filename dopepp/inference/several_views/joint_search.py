@@ -7,6 +7,7 @@ still determines the pose, because one pose in the world explains the keypoints 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.observations import PartObservation, make_observation
+from dopepp.recovery.detection import Detection, log_odds
 from dopepp.recovery.search import (
     JOINT_STEP,
     PosedMaps,
@@ -54,7 +56,9 @@ class JointSearch:
         self._searches: dict[str, PoseSearch] = {}
 
     def __call__(self, observation: PartObservation) -> PartObservation | None:
-        """Return an observation with the best pose at its centroid, before refinement.
+        """Return the observation of the best pose at an observation's centroid.
+
+        The pose is refined and verified in the view of the observation.
 
         Returns:
             The observation; None if the centroid or the range of depths is unknown.
@@ -74,17 +78,25 @@ class JointSearch:
         cuboid, focal_px = self._estimator.cuboids[number], focal_length(seen[0].K)
         T_cam_obj, stride = view.pose(T_world_obj), self._estimator.network.stride
         covariance = search_covariance(T_cam_obj, cuboid, focal_px, stride)
-        found = replace(
+        searched = replace(
             detection,
             T_cam_obj=T_cam_obj,
             keypoints=project_keypoints(cuboid, T_cam_obj, view.K),
             covariance=covariance,
-            kept="the pose was searched in the belief maps of all views",
             agreement=None,
-            support=None,
-            start=(T_cam_obj, covariance),
         )
-        return make_observation(observation.view, found, view)
+        return make_observation(observation.view, self._refined(searched, view), view)
+
+    def _refined(self, detection: Detection, view: PosedImage) -> Detection:
+        """Return a refined detection, whose score contains the log odds of the refined pose."""
+        assert self._estimator.refiner is not None  # several views require refinement
+        refined = self._estimator.refiner(detection, view.image, view.K, view.depth)
+        weights, before = self._estimator.recovery, log_odds(detection.probability or 0.0)
+        gain = weights.refined_verification * (log_odds(refined.probability or 0.0) - before)
+        odds = math.exp(log_odds(detection.score) + gain)
+        factor = 1.0 if refined.kept else weights.refined_covariance_factor
+        covariance = factor * refined.covariance
+        return replace(refined, score=odds / (1.0 + odds), covariance=covariance)
 
     def _search(self, name: str) -> PoseSearch:
         """Return the search of a part in the maps of all views, prepared once."""
