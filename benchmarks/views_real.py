@@ -112,6 +112,8 @@ class Frames:
 class DrawnEstimator:
     """Replaces a network: the detections are drawn around the published poses."""
 
+    timed, device = PoseEstimator.timed, torch.device("cpu")
+
     def __init__(self, part: Part, spread: float) -> None:
         self.covariance = spread**2 * COVARIANCE
         self.refine, self.parts, self.solid_parts = "region", (part,), (part,)
