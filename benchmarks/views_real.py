@@ -33,7 +33,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.rotation import nearest_rotation, rotation_vector_to_matrix
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.estimator import PoseEstimator, SeenMaps
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.metrics.functional import add, add_s
 from dopepp.parts.part import Part
@@ -111,9 +111,11 @@ class Frames:
 class DrawnEstimator:
     """Replaces a network: the detections are drawn around the published poses."""
 
+    timed, device = PoseEstimator.timed, torch.device("cpu")
+
     def __init__(self, part: Part, spread: float) -> None:
         self.covariance = spread**2 * COVARIANCE
-        self.refine, self.solid_parts = "region", (part,)
+        self.refine, self.parts, self.solid_parts = "region", (part,), (part,)
         self.refiner, self.recovery = Refiner("region", [part]), RecoveryOptions()
         self.min_score, self.spent_ms = (
             0.0,
@@ -121,14 +123,21 @@ class DrawnEstimator:
         )
         self.starts: dict[bytes, Transform] = {}
 
-    def candidates(self, image: np.ndarray, K: np.ndarray, *_: object) -> list[Detection]:
-        """Return the refined detection of an image."""
+    def start_detections(
+        self, image: np.ndarray, K: np.ndarray, *_: object
+    ) -> tuple[list[Detection], list[SeenMaps]]:
+        """Return the drawn detection of an image, without maps."""
         if (T := self.starts.get(image.tobytes())) is None:
-            return []
-        part, nothing = self.solid_parts[0], np.full((9, 2), np.nan)
+            return [], []
+        part, nothing = self.parts[0], np.full((9, 2), np.nan)
         keypoints = project_keypoints(part.cuboid, T, K)
-        start = Detection(part.name, 0.5, 0.5, T, keypoints, nothing, 0.0, self.covariance)
-        return recalibrate([self.refiner(start, image, K, None)], self.recovery)
+        return [Detection(part.name, 0.5, 0.5, T, keypoints, nothing, 0.0, self.covariance)], []
+
+    def candidates_from(
+        self, starts: list[Detection], image: np.ndarray, K: np.ndarray, *_: object
+    ) -> list[Detection]:
+        """Return the refined detections of an image."""
+        return recalibrate([self.refiner(start, image, K, None) for start in starts], self.recovery)
 
 
 def with_half_turn(part: Part) -> Part:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Unpack
+from typing import TYPE_CHECKING, Literal, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -48,6 +48,14 @@ if TYPE_CHECKING:
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
 ]
+
+
+class SeenMaps(NamedTuple):
+    """Belief maps of an image in one size."""
+
+    K: CameraMatrix  # of the network's input, pixels
+    belief: Float[torch.Tensor, "beliefs height width"]
+    depths: list[tuple[float, float] | None] | None  # searched for each part; None: no search
 
 
 class PoseEstimator:
@@ -279,20 +287,17 @@ class PoseEstimator:
         with a network score below :data:`~dopepp.recovery.detection.CANDIDATE` are left out.
         """
         image, K, depth = prepare_image(image, K, distortion, depth, cropped)
-        detections = self._start_detections(image, K, distances, roi)
-        if self.refiner is None:
-            return detections
-        by_depth = depth is not None and self.refiner.uses_depth
-        return self._recalibrated(self.refined(detections, image, K, depth), by_depth)
+        starts, _ = self.start_detections(image, K, distances, roi)
+        return self.candidates_from(starts, image, K, depth)
 
-    def _start_detections(
+    def start_detections(
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> list[Detection]:
-        """Return the detections before refinement, best score first."""
+    ) -> tuple[list[Detection], list[SeenMaps]]:
+        """Return detections before refinement, best score first, and the maps that show them."""
         with self.timed("pre"):
             views = self.views(image, K, distances, roi)
         stride, options = self.network.stride, self._recovery_options(0.0)
-        scales: list[list[Detection]] = []
+        scales, seen = list[list[Detection]](), list[SeenMaps]()
         for view in views:
             # A second view hardly improves a probable detection, and doubles the time.
             if view.is_further and self._detects_all_parts(scales):
@@ -302,14 +307,29 @@ class PoseEstimator:
             with self.timed("network"):
                 belief, field = self.maps(pixels)
             with self.timed("decode"):
+                depths = self._searched_depths(view)
                 detections = recover(
                     belief, field, self.cuboids, view.K, stride, self._names,
-                    self._searched_depths(view), **options,
+                    depths, **options,
                 )  # fmt: skip
             scales.append(
                 [view.to_image(item, self._cuboid_of[item.object], K) for item in detections]
             )
-        return merge_scales(scales)
+            seen.append(SeenMaps(view.K, belief, depths))
+        return merge_scales(scales), seen
+
+    def candidates_from(
+        self,
+        starts: Sequence[Detection],
+        image: RGBImage,
+        K: CameraMatrix,
+        depth: Depth | None = None,
+    ) -> list[Detection]:
+        """Return start detections after refinement, with scores of refined poses, best first."""
+        if self.refiner is None:
+            return list(starts)
+        by_depth = depth is not None and self.refiner.uses_depth
+        return self._recalibrated(self.refined(starts, image, K, depth), by_depth)
 
     def _detects_all_parts(self, scales: Sequence[Sequence[Detection]]) -> bool:
         """Return whether each part has a probable detection."""

@@ -20,7 +20,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.estimator import PoseEstimator, SeenMaps
 from dopepp.inference.network_input import (
     METRES,
     Depth,
@@ -135,10 +135,10 @@ class TemplateEstimator(PoseEstimator):
     def _detector(self) -> str:
         return "templates of meshes"
 
-    def _start_detections(
+    def start_detections(
         self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> list[Detection]:
-        """Return start poses of all parts, best score first."""
+    ) -> tuple[list[Detection], list[SeenMaps]]:
+        """Return start poses of all parts, best score first, and no maps."""
         with self.timed("decode"):
             roi, depths = check_region(roi, image), self._range(distances)
             starts = [
@@ -146,7 +146,7 @@ class TemplateEstimator(PoseEstimator):
                 for detector in self.detectors
                 for start in detector.detect(image, K, depths, roi)
             ]
-            return sorted(starts, key=lambda detection: -detection.score)
+            return sorted(starts, key=lambda detection: -detection.score), []
 
     def refined(
         self,
@@ -251,7 +251,7 @@ class TemplateEstimator(PoseEstimator):
         """Return a reason for each part without a start detection."""
         near, far = self._range(distances)
         text = f"no view of the part fits the image at {near:.2g} – {far:.2g} m"
-        starts = self._start_detections(image, K, distances, roi)
+        starts, _ = self.start_detections(image, K, distances, roi)
         detected = {start.object for start in starts}
         names = [part.name for part in self.parts if part.name not in detected]
         return [Reason(name, "empty", 0.0, text) for name in names]

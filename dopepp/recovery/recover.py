@@ -25,7 +25,7 @@ from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, make_detection
-from dopepp.recovery.search import CLEAR, Depths, PoseSearch
+from dopepp.recovery.search import CLEAR, Depths, PosedMaps, PoseSearch
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -155,8 +155,9 @@ def recover_batch(
                 if reach is not None and is_clear and not is_probable:
                     if search is None:
                         maps = beliefs.float().cpu().numpy()
-                        search = PoseSearch(maps, cuboid, camera, stride, reach)
-                    solved = search.solve(group, object_peaks)
+                        posed = PosedMaps(maps, camera, stride, np.eye(4))
+                        search = PoseSearch([posed], cuboid)
+                    solved = search.solve(group, object_peaks, reach)
                     searched = make_detection(*solved, cuboid, camera, name, chosen)
                     if detection is None or detection.score < chosen.min_score:
                         detection = searched

@@ -11,7 +11,9 @@ from numpy.testing import assert_allclose
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, move_pose, resize_camera
 from dopepp.geometry.camera_file import Camera
+from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.inference.several_views.joint_search import JointSearch
 from dopepp.virtual import render
 from dopepp.virtual.sensor import capture
 
@@ -178,10 +180,10 @@ def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views):
 def test_unrefined_detection_does_not_overrule_the_other_views(
     estimator, scene, views, true, monkeypatch
 ):
-    candidates, calls = estimator.candidates, []
+    candidates_from, calls = estimator.candidates_from, []
 
     def with_a_wrong_second_view(*given):
-        detections = candidates(*given)
+        detections = candidates_from(*given)
         calls.append(len(detections))
         if len(calls) < 2:
             return detections
@@ -193,13 +195,48 @@ def test_unrefined_detection_does_not_overrule_the_other_views(
         }  # fmt: skip
         return [replace(detections[0], **unrefined)]
 
-    monkeypatch.setattr(estimator, "candidates", with_a_wrong_second_view)
+    monkeypatch.setattr(estimator, "candidates_from", with_a_wrong_second_view)
     result = predicted(estimator, scene, views)
     assert len(calls) == 2
     (detection,) = result.detections
     assert detection.views == ["view 0", "view 1"]
     assert max(errors(detection.T_world_obj, true)) < 0.5
     assert not result.findings
+
+
+def test_wrong_poses_are_replaced_by_a_search_in_all_views(
+    estimator, scene, views, true, monkeypatch
+):
+    """Both detections have a wrong rotation, and only their centroids are right."""
+    candidates_from, cuboid = estimator.candidates_from, estimator.cuboids[0]
+    turn = rotation_vector_to_matrix(np.array([0.0, 2.0, 0.0]))
+    wrong_poses = []
+
+    def turned(*given):
+        detection = candidates_from(*given)[0]
+        T = detection.T_cam_obj
+        centroid = T[:3, :3] @ cuboid[CENTROID] + T[:3, 3]
+        rotation = T[:3, :3] @ turn
+        wrong = make_transform(rotation, centroid - rotation @ cuboid[CENTROID])
+        wrong_poses.append(wrong)
+        return [replace(detection, T_cam_obj=wrong, score=0.01, probability=0.01)]
+
+    monkeypatch.setattr(estimator, "candidates_from", turned)
+    result = predicted(estimator, scene, views)
+    (detection,) = result.detections
+    assert len(wrong_poses) == 2
+    assert errors(wrong_poses[0], true)[0] > 90
+    assert max(errors(detection.T_world_obj, true)) < 0.5
+    assert detection.views == ["view 0", "view 1"]
+    assert not result.findings
+
+
+def test_a_probable_pose_needs_no_search(estimator, scene, views, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("a pose was searched")
+
+    monkeypatch.setattr(JointSearch, "__call__", refuse)
+    assert predicted(estimator, scene, views).detections
 
 
 def test_views_may_have_different_sizes_and_lenses(estimator, scene, views, true):

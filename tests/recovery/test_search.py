@@ -1,12 +1,13 @@
 """Poses that are searched in the belief maps."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from dopepp.geometry.camera import move_pose, project_keypoints, transform
+from dopepp.geometry.camera import move_pose, orbited_camera, project_keypoints, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.recovery import recover
 from dopepp.recovery.detection import PROBABLE
@@ -14,8 +15,11 @@ from dopepp.recovery.search import (
     CENTROID_DEVIATION,
     CLEAR,
     DEPTH_DEVIATION,
+    JOINT_STEP,
     ROTATION_DEVIATION,
+    PosedMaps,
     PoseSearch,
+    centres_on_ray,
     search_covariance,
 )
 
@@ -27,6 +31,12 @@ def distance(T, other):
     return np.degrees(rotation_angle(T[:3, :3].T @ other[:3, :3])), abs(T[2, 3] / other[2, 3] - 1)
 
 
+def searched(belief, cuboid, K, centroid, depths):
+    """Return the pose that is searched on one image at a centroid."""
+    search = PoseSearch([PosedMaps(belief, K, 8, np.eye(4))], cuboid)
+    return search.pose(centres_on_ray(centroid, K, depths))
+
+
 @pytest.mark.parametrize("hidden", [0, 3])
 def test_the_pose_is_found_without_peaks(make_scene, box, pose, K, hidden):
     """Also with hidden corners, and with all corners of a neighbour that touches the part."""
@@ -36,7 +46,7 @@ def test_the_pose_is_found_without_peaks(make_scene, box, pose, K, hidden):
         own, other = (make_scene(box).place(0, place).maps()[0].numpy() for place in (T, beside))
         own[rng.permutation(8)[:hidden]] = 0.0
         centroid = project_keypoints(box, T, K)[8]
-        found = PoseSearch(np.maximum(own, other), box, K, 8, DEPTHS).pose(centroid)
+        found = searched(np.maximum(own, other), box, K, centroid, DEPTHS)
         angle, difference = distance(found, T)
         assert angle < 20
         assert difference < 0.12
@@ -44,10 +54,32 @@ def test_the_pose_is_found_without_peaks(make_scene, box, pose, K, hidden):
 
 
 def test_maps_without_corners_give_a_pose_at_the_centroid(box, K):
-    search = PoseSearch(np.zeros((9, 52, 52), np.float32), box, K, 8, (1, 1))
-    found = search.pose(np.array([90.0, 40.0]))
+    empty = np.zeros((9, 52, 52), np.float32)
+    found = searched(empty, box, K, np.array([90.0, 40.0]), (1, 1))
     assert_allclose(project_keypoints(box, found, K)[8], [90, 40], atol=1e-6)
     assert transform(found, box[8])[2] == pytest.approx(1.0)
+
+
+def test_two_images_determine_a_pose_together(make_scene, box, pose, K):
+    """The first image has one corner, which does not determine the pose alone."""
+    rng = np.random.default_rng(3)
+    together, alone = [], []
+    for _ in range(6):
+        T = pose(rng, 0.02, -0.01, 0.55)
+        poses = [np.eye(4), orbited_camera(T[:3, 3], math.radians(25), rng.uniform(0, 6))]
+        corners, maps = rng.permutation(8), []
+        for number, T_cam_world in enumerate(poses):
+            belief = make_scene(box).place(0, T_cam_world @ T).maps()[0].numpy()
+            shown = [*(corners[:1], corners[1:3])[number], 8]
+            belief[np.setdiff1d(np.arange(9), shown)] = 0.0
+            maps.append(PosedMaps(belief, K, 8, T_cam_world))
+        tried = centres_on_ray(project_keypoints(box, T, K)[8], K, DEPTHS, JOINT_STEP)
+        together.append(distance(PoseSearch(maps, box).pose(tried), T))
+        alone.append(distance(PoseSearch(maps[:1], box).pose(tried), T))
+    angles, differences = np.transpose(together)
+    assert angles.max() < 20
+    assert differences.max() < 0.05
+    assert np.median(np.transpose(alone)[0]) > 40
 
 
 def test_the_covariance_agrees_with_sampled_poses(K, pose):

@@ -32,7 +32,7 @@ from dopepp.inference.refinement.region import (
     search_distance,
 )
 from dopepp.inference.refinement.region.round import OutlineAgreement, Round
-from dopepp.inference.refinement.region.shifts import FOLLOWED, FOUND, Weights
+from dopepp.inference.refinement.region.shifts import FOLLOWED, JOINT, Weights
 from dopepp.inference.refinement.solver import (
     NormalEquations,
     PoseMatrix,
@@ -158,7 +158,7 @@ def refine_views(
     Raises:
         UndecidedError: No view shows the part's outline, at the start or later.
     """
-    covariance, weights = np.linalg.inv(start.information), FOLLOWED if followed else FOUND
+    covariance, weights = np.linalg.inv(start.information), FOLLOWED if followed else JOINT
     searches: list[_ViewSearch] = []
     for number, view in enumerate(views):
         try:

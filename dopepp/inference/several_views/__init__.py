@@ -4,7 +4,8 @@
 2. Detections of several views that agree in the world are associated with one part
    (:mod:`~dopepp.inference.several_views.observations`).
 3. The pose of each part is refined on all views together and verified in each view
-   (:mod:`~dopepp.inference.several_views.joint`).
+   (:mod:`~dopepp.inference.several_views.joint`). If no pose is probable, a pose is searched in the
+   belief maps of all views (:mod:`~dopepp.inference.several_views.joint_search`).
 4. Of several parts with the same name and pose, the part with the best score remains.
 5. Contradictions between views are reported
    (:mod:`~dopepp.inference.several_views.contradictions`).
@@ -30,6 +31,7 @@ from dopepp.inference.pose_result import PoseResult, Shape, elapsed_by_step
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.contradictions import contradictions
 from dopepp.inference.several_views.joint import JointEstimator
+from dopepp.inference.several_views.joint_search import JointSearch
 from dopepp.inference.several_views.observations import (
     PartGeometry,
     PartObservation,
@@ -39,7 +41,8 @@ from dopepp.inference.several_views.observations import (
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
 
 if TYPE_CHECKING:
-    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.inference.estimator import PoseEstimator, SeenMaps
+    from dopepp.recovery.detection import Detection
 
 CAMERA_ERROR: Final = (2e-4, math.radians(0.02))
 """Default standard deviations of a camera's pose: position along each axis (metres), rotation about
@@ -105,10 +108,11 @@ def search(
         regions: Region to search in each view, None to search nothing (default: whole images).
     """
     before = dict(estimator.spent_ms)
-    observations = _observations(estimator, joint.views, distances, regions)
+    observations, maps = _observations(estimator, joint.views, distances, regions)
     associated, least = partial(associate, geometries=joint.geometries), estimator.min_score
     with estimator.timed("refine"):
-        parts = [part.detection for part in joint.parts(associated(observations))]
+        in_maps = JointSearch(estimator, joint.views, maps)
+        parts = [part.detection for part in joint.parts(associated(observations), in_maps)]
     strong = [[item for item in view if item.detection.score >= least] for view in observations]
     passed, findings = contradictions(
         [part for part in parts if part.score >= least],
@@ -203,13 +207,17 @@ def _observations(
     views: Sequence[PosedImage],
     distances: Distances | None,
     regions: Sequence[Region | None] | None,
-) -> list[list[PartObservation]]:
-    """Detect parts in each view alone; see :func:`search`."""
+) -> tuple[list[list[PartObservation]], list[list[SeenMaps]]]:
+    """Detect parts in each view alone, and return each view's maps; see :func:`search`."""
     observations: list[list[PartObservation]] = []
+    maps: list[list[SeenMaps]] = []
     for number, view in enumerate(views):
         region = None if regions is None else regions[number]
-        given = view.image, view.K, None, view.depth, distances, region
-        is_searched = regions is None or region is not None
-        candidates = estimator.candidates(*given) if is_searched else []
+        starts: list[Detection] = []
+        seen: list[SeenMaps] = []
+        if regions is None or region is not None:
+            starts, seen = estimator.start_detections(view.image, view.K, distances, region)
+        candidates = estimator.candidates_from(starts, view.image, view.K, view.depth)
         observations.append([make_observation(number, candidate, view) for candidate in candidates])
-    return observations
+        maps.append(seen)
+    return observations, maps

@@ -8,7 +8,7 @@ best single view.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -27,7 +27,7 @@ from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import PoseMatrix, Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
-from dopepp.recovery.detection import Detection, log_odds
+from dopepp.recovery.detection import PROBABLE, Detection, log_odds
 
 SUPPORTING: Final = 0.2
 """Smallest probability at which a view supports a pose."""
@@ -56,6 +56,9 @@ REGULAR: Final = 1e-3
 
 USUAL_MOVE: Final = 1.0
 """Assumed Mahalanobis distance between start and refined pose, a feature of the verification."""
+
+Search = Callable[[PartObservation], PartObservation | None]
+"""Returns an observation at the same centroid with another pose; None if none is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,17 +91,33 @@ class JointEstimator:
         self._refiner, self.views, self.names = refiner, views, names
         self.geometries, self._slope = geometries, slope
 
-    def parts(self, clusters: Sequence[Sequence[PartObservation]]) -> list[JointPart]:
+    def parts(
+        self, clusters: Sequence[Sequence[PartObservation]], search: Search
+    ) -> list[JointPart]:
         """Estimate one part per cluster of observations, drop duplicates, and sort by score.
 
         Each observation that disagrees with its cluster's joint pose becomes a separate cluster.
+        Where no pose is probable, ``search`` returns another start. Its result is used if it is
+        probable and at least two views show the part.
+
+        Args:
+            clusters: Observations of each possible part, best first; the best cluster first.
+            search: Search in the belief maps of all views.
         """
         parts: list[JointPart] = []
         waiting = list(clusters)
         while waiting:
-            cluster = waiting.pop()
-            parts.append(self.estimate(cluster))
-            waiting += [[other] for other in cluster if other not in parts[-1].observations]
+            cluster = waiting.pop(0)
+            part = self.estimate(cluster)
+            waiting += [[other] for other in cluster if other not in part.observations]
+            is_doubtful = part.detection.probability < PROBABLE
+            if is_doubtful and not any(_is_at(found, cluster[0]) for found in parts):
+                searched = search(cluster[0])
+                other = part if searched is None else self.estimate([searched])
+                if other.detection.probability >= PROBABLE and len(other.detection.views) > 1:
+                    part = other
+                    waiting = [rest for rest in waiting if not _is_at(part, rest[0])]
+            parts.append(part)
         parts.sort(key=lambda part: -part.detection.score)
         kept: list[JointPart] = []
         for part in parts:
@@ -340,18 +359,25 @@ def _lasting_error(
     return np.asarray(gain @ pulled @ gain.T)
 
 
+def _is_at(part: JointPart, observation: PartObservation) -> bool:
+    """Return whether an observation is at the position of a probable part in its view."""
+    seen = part.detection.evidence[observation.view].detection
+    return part.detection.probability >= PROBABLE and are_same(seen, observation.detection)
+
+
 def _is_duplicate(part: JointPart, better: JointPart) -> bool:
     """Return whether two parts are the same instance, detected twice.
 
-    Both must be at the same position in every view. If a view supports only the first part, the
-    covariances must also explain the difference of the poses, or else the views contradict.
+    Both must be at the same position in every view. Either the covariances explain the difference
+    of the poses, or the parts have observations of different views, and the better part is
+    supported by all views of the other part. Otherwise the views contradict.
     """
     detection, other = part.detection, better.detection
     shared = {item.view for item in part.observations} & {item.view for item in better.observations}
     pairs = zip(detection.evidence, other.evidence, strict=True)
-    if shared or not all(are_same(a.detection, b.detection) for a, b in pairs):
+    if not all(are_same(a.detection, b.detection) for a, b in pairs):
         return False
-    is_supported = set(detection.views) <= set(other.views)
+    is_supported = not shared and set(detection.views) <= set(other.views)
     return is_supported or separation(detection.pose, other.pose) <= CONSISTENT
 
 

@@ -42,6 +42,9 @@ class Weights(NamedTuple):
 FOUND: Final = Weights(colour=0.5, edge=1.0)
 """Weights for an inaccurate start pose: colours decide which of many edges is the part's border."""
 
+JOINT: Final = Weights(colour=0.35, edge=2.0)
+"""Weights for several views, which start near the correct pose."""
+
 FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
 """Weights for a tracked part: the nearest edge is the part's border, and blur does not shift the
 edge's centre. For inaccurate start poses, these weights are worse than :data:`FOUND`."""

@@ -1,0 +1,115 @@
+"""Search for a part's pose in the belief maps of all views together.
+
+In each view, too few keypoints may be visible for PnP. The sum of the log beliefs of all views then
+still determines the pose, because one pose in the world explains the keypoints in all images
+(:mod:`dopepp.recovery.search`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dopepp.geometry.camera import (
+    focal_length,
+    invert_transform,
+    project_keypoints,
+    transform,
+)
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.inference.refinement.joint_refinement import PosedImage
+from dopepp.inference.several_views.observations import PartObservation, make_observation
+from dopepp.recovery.detection import Detection, log_odds
+from dopepp.recovery.search import (
+    JOINT_STEP,
+    PosedMaps,
+    PoseSearch,
+    centres_on_ray,
+    search_covariance,
+)
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator, SeenMaps
+
+
+class JointSearch:
+    """Searches poses at the centroid of a detection in one view.
+
+    Args:
+        estimator: Estimator of the parts.
+        views: Images with the poses of their cameras.
+        maps: Maps of each view in all sizes.
+    """
+
+    def __init__(
+        self,
+        estimator: PoseEstimator,
+        views: Sequence[PosedImage],
+        maps: Sequence[Sequence[SeenMaps]],
+    ) -> None:
+        self._estimator, self._views, self._maps = estimator, views, maps
+        self._numbers = {part.name: number for number, part in enumerate(estimator.parts)}
+        self._searches: dict[str, PoseSearch] = {}
+
+    def __call__(self, observation: PartObservation) -> PartObservation | None:
+        """Return the observation of the best pose at an observation's centroid.
+
+        The pose is refined and verified in the view of the observation.
+
+        Returns:
+            The observation; None if the centroid or the range of depths is unknown.
+        """
+        detection, view = observation.detection, self._views[observation.view]
+        number, seen = self._numbers[detection.object], self._maps[observation.view]
+        ranges = [item.depths[number] for item in seen if item.depths is not None]
+        known = [depths for depths in ranges if depths is not None]
+        centroid = detection.peaks[CENTROID]
+        if not known or not np.isfinite(centroid).all():
+            return None
+        depths = min(near for near, _ in known), max(far for _, far in known)
+        tried = centres_on_ray(centroid, view.K, depths, JOINT_STEP)
+        T_world_obj = self._search(detection.object).pose(
+            transform(invert_transform(view.T_cam_world), tried)
+        )
+        cuboid, focal_px = self._estimator.cuboids[number], focal_length(seen[0].K)
+        T_cam_obj, stride = view.pose(T_world_obj), self._estimator.network.stride
+        covariance = search_covariance(T_cam_obj, cuboid, focal_px, stride)
+        searched = replace(
+            detection,
+            T_cam_obj=T_cam_obj,
+            keypoints=project_keypoints(cuboid, T_cam_obj, view.K),
+            covariance=covariance,
+            agreement=None,
+        )
+        return make_observation(observation.view, self._refined(searched, view), view)
+
+    def _refined(self, detection: Detection, view: PosedImage) -> Detection:
+        """Return a refined detection, whose score contains the log odds of the refined pose."""
+        assert self._estimator.refiner is not None  # several views require refinement
+        refined = self._estimator.refiner(detection, view.image, view.K, view.depth)
+        weights, before = self._estimator.recovery, log_odds(detection.probability or 0.0)
+        gain = weights.refined_verification * (log_odds(refined.probability or 0.0) - before)
+        odds = math.exp(log_odds(detection.score) + gain)
+        factor = 1.0 if refined.kept else weights.refined_covariance_factor
+        covariance = factor * refined.covariance
+        return replace(refined, score=odds / (1.0 + odds), covariance=covariance)
+
+    def _search(self, name: str) -> PoseSearch:
+        """Return the search of a part in the maps of all views, prepared once."""
+        if name not in self._searches:
+            number = self._numbers[name]
+            cuboid, stride = self._estimator.cuboids[number], self._estimator.network.stride
+            channels = slice(number * len(cuboid), (number + 1) * len(cuboid))
+            posed = [
+                PosedMaps(
+                    item.belief[channels].float().cpu().numpy(), item.K, stride, view.T_cam_world
+                )
+                for view, seen in zip(self._views, self._maps, strict=True)
+                for item in seen
+            ]
+            self._searches[name] = PoseSearch(posed, cuboid)
+        return self._searches[name]
