@@ -30,7 +30,8 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import make_part
 from dopepp.virtual import Factory
 from dopepp.virtual.presets import preset_of
-from tests.data.makers import mesh_of, write_set
+from tests.data.makers import write_set
+from tests.parts.makers import mesh_of
 
 SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
          "placement": {"nearest": 0.42, "farthest": 0.58}, "targets_per_image": [2, 2]}  # fmt: skip
