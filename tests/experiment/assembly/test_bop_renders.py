@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -47,7 +46,9 @@ def root(tmp_path_factory):
     source = RenderedSource(Factory(parts, preset_of("upright", SCENE), 3), 4, "test")
     samples = [source.sample(index) for index in range(4)]
     folder = tmp_path_factory.mktemp("bop") / "set"
-    return write_set(partial(BopWriter, split="test"), folder, parts, samples)
+    write_set(BopWriter, folder, parts, samples)
+    (folder / "train_pbr").rename(folder / "test")
+    return folder
 
 
 @pytest.fixture
