@@ -90,7 +90,8 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
             tar.extractall(unpacked, filter="data")
         archive.unlink()
     except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as e:
-        raise _failed(source, f"the connection failed: {e or type(e).__name__}") from e
+        reason = e if isinstance(e, urllib.error.HTTPError) else getattr(e, "reason", e)
+        raise _failed(source, f"no connection: {reason or type(e).__name__}") from e
     except OSError as error:
         allowed = f"a writable folder with {2 * source.num_bytes} bytes of free space"
         fix = "pass another folder, or free space; the next call resumes the download"

@@ -23,7 +23,8 @@ from dopepp.virtual.presets import PRESETS
 from dopepp.virtual.renderers.raster import silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import make_surface
-from tests.data.makers import mesh_of, pose_at
+from tests.data.makers import pose_at
+from tests.parts.makers import mesh_of
 
 HALF = np.array([0.04, 0.03, 0.02])
 
@@ -152,7 +153,7 @@ def samples(parts):
 @pytest.fixture(scope="session")
 def boxes():
     """Two boxes of 60 × 40 × 24 mm, and three images of both, the second in front of the first."""
-    mesh = mesh_of(BOX, 0.001)
+    mesh = mesh_of(BOX, scale=0.001)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])[None]
     axis = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     parts = [

@@ -20,7 +20,7 @@ from dopepp.data.render_job import RenderJob, make_job
 from dopepp.data.sample import Sample, SourceInfo
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.parts.part import Mesh, Part
+from dopepp.parts.part import Part
 
 
 @dataclass(eq=False)
@@ -51,11 +51,6 @@ class MadeSource:
 def pose_at(x: float, y: float, z: float) -> np.ndarray:
     """Return the pose of an object that is moved and not rotated, metres."""
     return make_transform(np.eye(3), np.array([x, y, z], np.float64))
-
-
-def mesh_of(solid: Any, scale: float = 1.0) -> Mesh:
-    """Return trimesh's solid as a mesh; ``scale`` converts its unit to metres."""
-    return Mesh(scale * np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
 
 
 def edit_json(path: Path, change: Callable[[Any], Any]) -> None:

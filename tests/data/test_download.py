@@ -130,7 +130,7 @@ def test_failures_give_one_line(get, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.raises(UserError, match=r"/good: the connection failed: .*check the network"):
+    with pytest.raises(UserError, match=r"/good: no connection: .*check the network"):
         get(address=f"http://127.0.0.1:{port}")
     (tmp_path / "tiny.tar.partial").write_bytes(b"1000")
     with pytest.raises(UserError, match=r"continues at 'bytes 0-.* instead of byte 4"):

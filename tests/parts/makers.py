@@ -6,10 +6,10 @@ import trimesh
 from dopepp.parts.part import Mesh
 
 
-def mesh_of(*solids):
-    """Return the mesh of one or more solids of trimesh."""
+def mesh_of(*solids, scale=1.0):
+    """Return the mesh of one or more solids of trimesh; ``scale`` converts their unit to metres."""
     solid = trimesh.util.concatenate(solids) if len(solids) > 1 else solids[0]
-    return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
+    return Mesh(scale * np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
 
 
 def solid_of(mesh):

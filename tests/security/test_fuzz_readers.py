@@ -40,7 +40,8 @@ from dopepp.models.checkpoint import load_network
 from dopepp.models.storage import read_safetensors, write_safetensors
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import make_part
-from tests.data.makers import LAYOUTS, mesh_of, pose_at, write_set
+from tests.data.makers import LAYOUTS, pose_at, write_set
+from tests.parts.makers import mesh_of
 
 QUICK: Final = 6
 THOROUGH: Final = 300

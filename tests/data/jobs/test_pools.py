@@ -1,7 +1,6 @@
 """Pools of processes, Ray clusters and killed jobs write the same bytes."""
 
 import os
-import pickle
 import random
 import signal
 import subprocess
@@ -14,8 +13,8 @@ import pytest
 from dopepp.core.errors import StoppedError, UserError
 from dopepp.core.pool import ClusterPool, ProcessPool
 from dopepp.data.check import check_dataset
-from dopepp.data.render_job import WRITERS, claim
-from dopepp.data.render_run import RenderTask, RenderTasks, Shard, render_dataset
+from dopepp.data.render_job import WRITERS
+from dopepp.data.render_run import Shard, render_dataset
 from tests.core.test_pool import wait_for_group
 from tests.data.makers import contents, small_job
 
@@ -67,23 +66,6 @@ def test_workers_and_nodes_write_the_same_bytes(layout, two_nodes, tmp_path):
     whole = contents(tmp_path / "1")
     assert sum(len(content) for content in whole.values()) > 1000 * NUM
     assert (contents(tmp_path / "2"), contents(tmp_path / "ray")) == (whole, whole)
-
-
-@pytest.mark.slow
-def test_both_nodes_work_and_tasks_of_a_lost_node_are_repeated(two_nodes, tmp_path):
-    job = small_job("ndds")
-    claim(tmp_path, job.record)
-    job.writer(tmp_path).prepare()
-    second = two_nodes.add_node(num_cpus=1, object_store_memory=80_000_000)
-    done = []
-    with ClusterPool(pickle.dumps(RenderTasks(job, tmp_path)), two_nodes.address, 1) as pool:
-        for task, future in pool.run(RenderTask(0, range(i, i + 8)) for i in range(0, 160, 8)):
-            future.result()
-            done += task.indices
-            if len(done) == 40:
-                two_nodes.remove_node(second, allow_graceful=False)
-    assert sorted(done) == list(range(160))
-    assert len(list(tmp_path.glob("0*.json"))) == 160
 
 
 COMMAND = "import sys; from dopepp.cli import app; sys.argv[0] = 'dopepp'; app()"

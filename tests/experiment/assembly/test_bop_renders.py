@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -30,7 +29,8 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import make_part
 from dopepp.virtual import Factory
 from dopepp.virtual.presets import preset_of
-from tests.data.makers import mesh_of, write_set
+from tests.data.makers import write_set
+from tests.parts.makers import mesh_of
 
 SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
          "placement": {"nearest": 0.42, "farthest": 0.58}, "targets_per_image": [2, 2]}  # fmt: skip
@@ -46,7 +46,9 @@ def root(tmp_path_factory):
     source = RenderedSource(Factory(parts, preset_of("upright", SCENE), 3), 4, "test")
     samples = [source.sample(index) for index in range(4)]
     folder = tmp_path_factory.mktemp("bop") / "set"
-    return write_set(partial(BopWriter, split="test"), folder, parts, samples)
+    write_set(BopWriter, folder, parts, samples)
+    (folder / "train_pbr").rename(folder / "test")
+    return folder
 
 
 @pytest.fixture

@@ -19,7 +19,8 @@ from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import make_part
-from tests.data.makers import edit_json, mesh_of, pose_at
+from tests.data.makers import edit_json, pose_at
+from tests.parts.makers import mesh_of
 
 INFO, PLY = "models/models_info.json", "models/obj_000001.ply"
 

@@ -12,7 +12,8 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Part, make_part
 from dopepp.virtual.surface import make_surface
-from tests.data.makers import mesh_of, pose_at, write_set
+from tests.data.makers import pose_at, write_set
+from tests.parts.makers import mesh_of
 
 K = camera_matrix(100.0, 100.0, 15.5, 11.5)
 
