@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dopepp.core.files import write_png
 from dopepp.data.formats.bop.bop_results import UNKNOWN_TIME, BopResult, results_name, write_results
 from dopepp.data.sample import SampleSource
@@ -37,6 +39,7 @@ from dopepp.experiment.results.measurement import (
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refine, refine_terms
+from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Parts
 from dopepp.recovery.recover import summary
 
@@ -122,6 +125,11 @@ def measure_and_record(
         _record_false_alarms(run_dir, detectors, reports, without_parts)
     if refines:
         main.refined = reports[-1]
+        shares = main.details["made_worse"] = made_worse(
+            measured.metrics[main.name], measured.metrics[main.refined.name]
+        )
+        in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
+        display.console.print(f"poses that refinement made worse by over 1 mm: {in_words}")
     write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -162,6 +170,22 @@ def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> P
         part if part.mesh is not None else by_name.get(part.name, part) for part in estimator.parts
     ]
     return estimator.refining(refine, own_parts)
+
+
+def made_worse(network: PoseMetrics, refined: PoseMetrics) -> dict[str, float]:
+    """Return the shares of refined poses whose ADD or translation error grew by more than 1 mm.
+
+    Parts that are missing after refinement are ignored; the recall includes them.
+    """
+    shares = {}
+    for error in ("add", "translation"):
+        before, after = (
+            np.concatenate([method.errors(name, error) for name in refined.parts])
+            for method in (network, refined)
+        )
+        is_worse = (after > before + 0.001)[np.isfinite(after)]
+        shares[error] = float(is_worse.mean()) if len(is_worse) else 0.0
+    return shares
 
 
 def _record_coverage(run_dir: Path, measured: Measured) -> None:

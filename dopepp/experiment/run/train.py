@@ -7,6 +7,7 @@ name to :class:`~dopepp.experiment.config.run_config.RunConfig`.
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -30,6 +31,7 @@ from dopepp.experiment.assembly.build_system import (
     keep_freed_memory,
 )
 from dopepp.experiment.assembly.photos import held_out_photos
+from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
 from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.conditions import check_masks
@@ -227,6 +229,24 @@ def _print_outcome(trainer: Trainer, run_dir: Path) -> None:
     rows = profile_rows(trainer.profiler)  # type: ignore[attr-defined]
     if rows:
         display.show_table(f"running time by function; details in {run_dir / PROFILE}", rows)
+
+
+def template_commands(data: DataConfig) -> list[str]:
+    """Return commands that estimate the parts' poses by templates with the user's camera."""
+    virtual, lens = data.virtual, data.virtual.camera
+    if data.root is not None or lens is None or virtual.working_distance is None:
+        return []
+    words = ["--K", *(f"{value:g}" for value in (lens.fx, lens.fy, lens.cx, lens.cy))]
+    words += ["--working-distance", ",".join(f"{metres:g}" for metres in virtual.working_distance)]
+    if data.unit is not None:
+        words += ["--unit", data.unit]
+    tilt_deg = getattr(data.preset.turning, "tilt_deg", None)
+    if tilt_deg is not None and data.preset.table is None:
+        words += ["--tilt", f"{tilt_deg:g}"]
+    return [
+        shlex.join(["dopepp", "predict", part, "IMAGE", *words, "--save", "out"])
+        for part in data.parts
+    ]
 
 
 def _resume_path(

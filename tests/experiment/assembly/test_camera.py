@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from dopepp.experiment.assembly.build_sources import (
     held_out_source,
 )
 from dopepp.experiment.config.data_config import evaluation_data
+from dopepp.experiment.run.train import template_commands
 from dopepp.parts.catalogue import pivconnector
 
 FOCAL = round(640 / math.tan(math.radians(69 / 2)), 1)
@@ -49,6 +51,18 @@ def my_part(parsed, camera):
         return fit_to_camera(config, build_parts(config.data))
 
     return make
+
+
+def test_template_commands(my_part):
+    lens = my_part().data.virtual.camera
+    K = " ".join(f"{value:g}" for value in (lens.fx, lens.fy, lens.cx, lens.cy))
+    end = f"IMAGE --K {K} --working-distance 0.4,0.7 --tilt 60 --save out"
+    assert template_commands(my_part().data) == [f"dopepp predict pivconnector {end}"]
+    data = replace(my_part().data, parts=("my part.stl",), unit="inch")
+    (command,) = template_commands(data)
+    assert command.startswith("dopepp predict 'my part.stl' IMAGE --K ")
+    assert " --unit inch " in command
+    assert template_commands(replace(data, virtual=replace(data.virtual, camera=None))) == []
 
 
 def test_automatic_sizes_are_stored_in_config_and_checkpoint(my_part, camera, caplog):

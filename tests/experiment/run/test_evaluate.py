@@ -11,7 +11,9 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.config.data_config import evaluation_data, stored_config
 from dopepp.experiment.config.run_config import FalsePositiveTarget
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
+from dopepp.experiment.results.recording import made_worse
 from dopepp.experiment.run.evaluate import tune_and_record
+from dopepp.metrics.pose import PoseMetrics
 from dopepp.models.checkpoint import read
 from dopepp.models.storage import write_atomic
 from dopepp.parts.catalogue import pivconnector
@@ -30,8 +32,10 @@ def test_refined_poses_are_measured_in_addition(evaluate, tmp_path):
     run = tmp_path / "run"
     written = read_json(run / METRICS_FILE)
     assert (written["name"], written["refined"]) == ("dopepp_fast", refined.to_record())
-    header = "| pivconnector | dopepp_fast | dopepp_fast + region |"
-    assert header in (run / "README.md").read_text()
+    assert written["made_worse"]["add"] == np.mean((after > before + 0.001)[np.isfinite(after)])
+    page, share = (run / "README.md").read_text(), 100 * written["made_worse"]["translation"]
+    assert "| pivconnector | dopepp_fast | dopepp_fast + region |" in page
+    assert f"{share:.1f} % in translation" in page
     curve = written["refined"]["coverage_curve"]["pivconnector"]
     assert curve["observed"][curve["nominal"].index(0.9)] == refined.mean.coverage
     assert (run / "coverage.png").is_file()
@@ -44,6 +48,25 @@ def test_a_small_scale_error_improves_the_distance(evaluate):
         return np.nanmedian(refined.errors["pivconnector"])
 
     assert median_error(0.0001) < 0.8 * median_error(0.05)
+
+
+def test_made_worse_counts_increases_over_a_millimetre():
+    part = pivconnector()
+
+    def measured(*offsets):
+        """Return the metrics of poses that are off along z; NaN misses the instance."""
+        metrics = PoseMetrics([part])
+        for offset in offsets:
+            T, estimate = np.eye(4), np.eye(4)
+            T[2, 3], estimate[2, 3] = 0.3, 0.3 + offset
+            pose = SimpleNamespace(object=part.name, score=1, T_cam_obj=estimate, covariance=None)
+            truth = SimpleNamespace(label=part.name, T_cam_obj=T, visible_fraction=1, wanted=None)
+            metrics.update([] if np.isnan(offset) else [pose], [truth])
+        return metrics
+
+    network = measured(0.002, 0.002, 0.002, np.nan, 0.002)
+    refined = measured(0.0029, 0.0031, 0.0001, np.nan, np.nan)
+    assert made_worse(network, refined) == pytest.approx({"add": 1 / 3, "translation": 1 / 3})
 
 
 def test_silent_images_are_counted_by_reason(evaluate, tmp_path, capsys):
