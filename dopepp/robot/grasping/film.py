@@ -50,7 +50,7 @@ def show(
     for failure, record in examples.items():
         attempts = trials.attempts(trials.scene(record.number), first)
         attempt = next(islice(attempts, record.attempt - 1, None), None)
-        if attempt is None:  # a trial is not exactly repeatable in another process
+        if attempt is None:  # with other threads, poses of a network may differ slightly
             failed_attempt = f"attempt {record.attempt} of trial {record.number}"
             _log.warning("no image of %r: %s did not happen again", failure, failed_attempt)
             continue
