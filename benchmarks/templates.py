@@ -69,7 +69,7 @@ def main() -> None:
     arguments = parser.parse_args()
     use_one_thread()
     near, far = (float(distance) for distance in arguments.distances.split(","))
-    model = arguments.folder / "models" / "obj_000001.ply"
+    model = arguments.folder / "models" / f"obj_{arguments.object:06d}.ply"
     part = load_solid_part(model, "mm", None, "auto")
     detector = TemplateDetector(part, (near, far), arguments.tilt)
     estimator = TemplateEstimator([detector], (near, far))

@@ -74,7 +74,8 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        write_file(partial_path(path), b"")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial_path(path).touch()
         partial_path(path).unlink()
     except OSError as error:
         problem, fix = f"{path}: {error.strerror}", "pass another path, or make it writable"

@@ -55,15 +55,17 @@ class FakePlanner:
         self.qualities = {int(name[1:]): quality for name, quality in qualities.items()}
         self.planned = []
 
-    def plan(self, poses, grasps, start):
+    def plan(self, poses, grasps, start, unexplained=None):
         height = round(1000 * poses[0][2, 3])
         self.planned.append(height)
         quality = self.qualities.get(height)
+        if unexplained is not None and height in unexplained:
+            return None
         return None if quality is None else SimpleNamespace(quality=quality)
 
 
-def choose(planner, parts, failed=()):
-    choice = choose_part(planner, parts, PLATE, [], HOME, failed)
+def choose(planner, parts, failed=(), unexplained=None):
+    choice = choose_part(planner, parts, PLATE, [], HOME, failed, unexplained)
     return choice and choice.number
 
 
@@ -83,6 +85,14 @@ def test_a_part_that_was_not_grasped_is_tried_after_the_others_until_it_moves():
     assert choose(planner, parts) == 0
     assert choose(planner, parts, [at(0.002, 0.0)]) == 1
     assert choose(planner, parts, [at(0.02, 0.0)]) == 0
+
+
+def test_a_part_beside_an_unexplained_region_is_chosen_last():
+    lower, upper = EstimatedPart(at(0.0, 0.0)), EstimatedPart(at(0.3, 0.001))
+    planner = FakePlanner(z0=1.0, z1=0.5)
+    assert choose(planner, [lower, upper], unexplained=()) == 0
+    assert choose(planner, [lower, upper], unexplained=(0,)) == 1
+    assert choose(planner, [lower, upper], unexplained=(0, 1)) == 0  # there is no other grasp
 
 
 COVARIANCE = np.diag(np.repeat([np.radians(0.3), 1e-3], 3) ** 2)
