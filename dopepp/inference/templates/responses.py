@@ -67,3 +67,9 @@ def _orient(gx: Array, gy: Array, maps: Array) -> None:
             for b in range(bins):
                 cosine = (x * cosines[b] + y * sines[b]) / length
                 maps[b, v, u] = int(strength * cosine * cosine * cosine * cosine)
+
+
+@compiled(fastmath=True)
+def orientation_bin(angle: float) -> int:
+    """Return the map of the edges whose normals have a direction, radians, above −8π."""
+    return int(angle * BINS / math.pi + 8 * BINS + 0.5) % BINS  # of a positive number
