@@ -248,7 +248,7 @@ def network_views(
         x, y, columns, rows = region
         image = image[y : y + rows, x : x + columns]
         K = crop_camera(K, x, y)
-    boxes = letterboxes(checkpoint, multiple, image, K, distances)
+    boxes = letterboxes(checkpoint, image, K, distances)
     views = [NetworkView(image, box, box.camera(K), (x, y), multiple) for box in boxes]
     further = _further_letterbox(checkpoint, image, K, boxes) if distances is None else None
     if further is not None:
@@ -284,7 +284,6 @@ def resize_and_pad(
 
 def letterboxes(
     checkpoint: Checkpoint,
-    multiple: int,
     image: RGBImage,
     K: CameraMatrix,
     distances: Distances | None = None,
@@ -310,7 +309,7 @@ def letterboxes(
             continue
         # For the training camera, use exactly the size of training images.
         is_trained_size = 1 / MARGIN < scale / learned.scale_x < MARGIN
-        boxes.append(learned if is_trained_size else _with_less_padding(size, scale, multiple))
+        boxes.append(learned if is_trained_size else Letterbox.scaled(size, scale))
     fitting = [box for box in boxes if box.width * box.height <= MAX_PIXELS]
     return fitting or [Letterbox.scaled(size, math.sqrt(MAX_PIXELS / (size[0] * size[1])))]
 
@@ -390,19 +389,6 @@ def _scales(seen: LearnedRange, reach: float, depths: tuple[float, float]) -> Se
     middles = near * (far / near) ** ((np.arange(count) + 0.5) / count)
     scales: list[float] = (math.sqrt(seen.smallest_px * seen.largest_px) * middles / reach).tolist()
     return scales
-
-
-def _with_less_padding(size: Size, scale: float, multiple: int) -> Letterbox:
-    """Return the size of an image at a scale, reduced by up to ``MARGIN`` if this saves padding."""
-    box = Letterbox.scaled(size, scale)
-    boxes = [box]
-    for side, whole in ((box.width, size[0]), (box.height, size[1])):
-        unpadded = side // multiple * multiple
-        if MARGIN * unpadded >= side:
-            boxes.append(Letterbox.scaled(size, unpadded / whole))
-    return min(
-        boxes, key=lambda box: math.ceil(box.width / multiple) * math.ceil(box.height / multiple)
-    )
 
 
 def are_same(first: Detection, second: Detection) -> bool:
