@@ -314,6 +314,11 @@ def log_odds(probability: float) -> float:
     return math.log(_odds(probability, _VERIFIED))
 
 
+def to_probability(odds: float) -> float:
+    """Return the probability whose odds have the natural logarithm ``odds``."""
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
 def _odds(probability: float, certain: float = _CERTAIN) -> float:
     """Return the odds of a probability after clipping it to [certain, 1 − certain]."""
     bounded = float(np.clip(probability, certain, 1 - certain))

@@ -27,7 +27,7 @@ from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import PoseMatrix, Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
 from dopepp.inference.several_views.views_result import Status, ViewEvidence, WorldDetection
-from dopepp.recovery.detection import PROBABLE, Detection, log_odds
+from dopepp.recovery.detection import PROBABLE, Detection, log_odds, to_probability
 
 SUPPORTING: Final = 0.2
 """Smallest probability at which a view supports a pose."""
@@ -331,9 +331,9 @@ class JointEstimator:
         )
         odds += COINCIDENCE * (max(len(observations), agreeing) - 1)
         # The score of the best single view, with the log odds of all views instead of this view's.
-        score = _probability(log_odds(best.score) + self._slope * (odds - single_odds))
+        score = to_probability(log_odds(best.score) + self._slope * (odds - single_odds))
         covariance = np.linalg.inv(pose.information)
-        given = best.object, score, _probability(odds), pose.T_cam_obj, covariance
+        given = best.object, score, to_probability(odds), pose.T_cam_obj, covariance
         return JointPart(observations, WorldDetection(*given, evidence, disagreement))
 
 
@@ -379,8 +379,3 @@ def _is_duplicate(part: JointPart, better: JointPart) -> bool:
         return False
     is_supported = not shared and set(detection.views) <= set(other.views)
     return is_supported or separation(detection.pose, other.pose) <= CONSISTENT
-
-
-def _probability(odds: float) -> float:
-    """Convert log odds to a probability."""
-    return 1.0 / (1.0 + math.exp(-odds))

@@ -7,7 +7,6 @@ still determines the pose, because one pose in the world explains the keypoints 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -23,7 +22,7 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.observations import PartObservation, make_observation
-from dopepp.recovery.detection import Detection, log_odds
+from dopepp.recovery.detection import Detection, log_odds, recalibrate, to_probability
 from dopepp.recovery.search import (
     JOINT_STEP,
     PosedMaps,
@@ -89,14 +88,14 @@ class JointSearch:
 
     def _refined(self, detection: Detection, view: PosedImage) -> Detection:
         """Return a refined detection, whose score contains the log odds of the refined pose."""
-        assert self._estimator.refiner is not None  # several views require refinement
-        refined = self._estimator.refiner(detection, view.image, view.K, view.depth)
-        weights, before = self._estimator.recovery, log_odds(detection.probability or 0.0)
-        gain = weights.refined_verification * (log_odds(refined.probability or 0.0) - before)
-        odds = math.exp(log_odds(detection.score) + gain)
-        factor = 1.0 if refined.kept else weights.refined_covariance_factor
-        covariance = factor * refined.covariance
-        return replace(refined, score=odds / (1.0 + odds), covariance=covariance)
+        refiner = self._estimator.refiner
+        assert refiner is not None  # several views require refinement
+        refined = refiner(detection, view.image, view.K, view.depth)
+        options, before = self._estimator.recovery, log_odds(detection.probability or 0.0)
+        gain = options.refined_verification * (log_odds(refined.probability or 0.0) - before)
+        by_depth = view.depth is not None and refiner.uses_depth
+        (calibrated,) = recalibrate([refined], options, by_depth)
+        return replace(calibrated, score=to_probability(log_odds(detection.score) + gain))
 
     def _search(self, name: str) -> PoseSearch:
         """Return the search of a part in the maps of all views, prepared once."""

@@ -385,7 +385,7 @@ class Trials:
     def _unexplained(
         self, image: RGBImage, lens: Camera, T_base_cam: Transform, parts: Sequence[EstimatedPart]
     ) -> Unexplained | None:
-        """Return the regions of a heap's image that probably show undetected parts."""
+        """Return the regions of a heap's image that probably show undetected parts, if any."""
         from dopepp.inference.network_input import prepare_image
 
         if self.task.layout != "heap":
@@ -393,7 +393,8 @@ class Trials:
         T_cam_base = invert_transform(T_base_cam)
         image, K, _ = prepare_image(image, lens.K, lens.coefficients)
         poses = [T_cam_base @ part.T_base_obj for part in parts]
-        return Unexplained(find_unexplained(image, K, self._outline, poses), K, T_cam_base)
+        mask = find_unexplained(image, K, self._outline, poses)
+        return Unexplained(mask, K, T_cam_base) if mask.any() else None
 
     def _likely(self, detections: Sequence[AnyDetection]) -> list[AnyDetection]:
         """Return the part's detections with at least half the score of its best detection."""
