@@ -20,6 +20,7 @@ from dopepp.geometry.camera_file import read_camera
 from dopepp.parts.part import Part
 from dopepp.virtual.presets import Preset, intrinsics_of
 from dopepp.virtual.presets.placement import WorkingPlacement
+from dopepp.virtual.thinness import thin_width
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +31,7 @@ MIN_PX: Final = 25.0
 _FINE_PX: Final = 45.0
 _USUAL_PX: Final = 70.0
 _WIDE_RATIO: Final = 3.5
+_THIN_PX: Final = 5.0  # width of thin features, e.g. of rods, at the largest distance
 
 _ROOM: Final = 1.3  # ratio of a window's shorter side to the diameter of the largest part
 _MULTIPLE: Final = 32  # both sides of a window are multiples of this number, pixels
@@ -106,11 +108,14 @@ class View:
     def scale_for(self, parts: Sequence[Part], window: Size | None = None) -> float:
         """Return the scale (at most 1) of the network's input relative to the camera's images.
 
-        The farthest part spans at least 45 pixels if the camera resolves that many; the nearest
-        part fits into ``window``.
+        The farthest part spans at least 45 pixels and its thin features 5 pixels, if the camera
+        resolves that many; the nearest part fits into ``window``.
         """
         smallest, largest = self.sizes_px(parts)
         scale = max(_USUAL_PX / math.sqrt(smallest * largest), _FINE_PX / smallest)
+        widths = (thin_width(part) * part.diameter for part in parts if part.mesh is not None)
+        thinnest = min(widths, default=math.inf)
+        scale = max(scale, _THIN_PX * self.distance[1] / (focal_length(self.K) * thinnest))
         if window is not None:
             scale = min(scale, min(window) / _ROOM / largest)
         return float(f"{min(scale, 1.0):.3g}")

@@ -63,6 +63,15 @@ def config(parsed, root):
     return make
 
 
+@pytest.mark.parametrize("symmetries", ["auto", "none"])
+def test_distances_without_a_camera_belong_to_the_camera_of_the_images(parsed, root, symmetries):
+    config = parsed("experiment=dragon", f"data.root={root}", "data.objects=[red]",
+                    f"data.symmetries={symmetries}")  # fmt: skip
+    fitted = fit_to_camera(config, build_parts(config.data)).data.virtual
+    assert (fitted.camera.fx, fitted.camera.fy) == (210.0, 211.0)
+    assert fitted.working_distance == (0.42, 0.6)
+
+
 def test_renders_have_the_camera_of_the_real_images(config, caplog):
     caplog.set_level("INFO")
     given = config("virtual.preset=upright")

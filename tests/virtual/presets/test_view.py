@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, project, transform
+from dopepp.geometry.camera import camera_matrix, focal_length, project, transform
 from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.part import make_part
 from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.presets.view import MIN_PX, View, read_lens
+from dopepp.virtual.thinness import thin_width
+from tests.parts.makers import mesh_of
 from tests.virtual.conftest import draw_scenes
 
 FOCAL = 640 / math.tan(math.radians(69 / 2))  # Of 1280 pixels that show 69°
@@ -56,6 +60,13 @@ def test_chosen_scales_and_windows_suit_the_network(near, ratio, diameter, portr
     assert all(side < scale * whole + 32 for side, whole in zip(window, first.size, strict=True))
     assert (window[0] >= window[1]) != (portrait and window[0] != window[1])
     first.check(parts, scale)
+
+
+def test_thin_features_have_five_pixels_at_the_largest_distance():
+    rod = make_part("rod", mesh_of(trimesh.creation.cylinder(0.004, 0.16)))
+    pixels = thin_width(rod) * rod.diameter * focal_length(K) / 0.7
+    assert view().scale_for([rod]) == pytest.approx(5 / pixels, rel=0.01)
+    assert view().scale_for([rod], (64, 64)) < 0.5 * view().scale_for([rod])
 
 
 def test_a_given_window_limits_the_scale():
