@@ -197,9 +197,12 @@ def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Return whether all floating-point values are finite; synchronises with the device once."""
-    flags = [tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point()]
-    return not flags or bool(torch.stack(flags).all())
+    """Return whether all floating-point values are finite; synchronises once with each device."""
+    flags: dict[torch.device, list[Tensor]] = {}  # an optimiser on a GPU counts steps on the CPU
+    for tensor in tensors:
+        if tensor.is_floating_point():
+            flags.setdefault(tensor.device, []).append(tensor.isfinite().all())
+    return all(bool(torch.stack(same).all()) for same in flags.values())
 
 
 def check_state(checkpoint: Mapping[str, Any]) -> None:
