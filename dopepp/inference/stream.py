@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, Unpack
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_formats import Size
 from dopepp.inference.frames import CameraFrame, SourceLike, open_sources
 from dopepp.inference.frames.source import Lens, choose_camera
-from dopepp.inference.network_input import Distances, Region
-from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
+from dopepp.inference.network_input import Depth, Distances, Region
+from dopepp.inference.pose_result import PoseResult, Shape, elapsed_by_step, make_shape
 from dopepp.inference.tracker import PoseTracker
 
 if TYPE_CHECKING:
@@ -69,56 +69,58 @@ def stream(
     stride = check("stride", options.get("stride", 1), int, Range(1, 1_000_000))
     estimator = estimator.reporting(options.get("min_score"))
     shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
+    distances, roi = options.get("distances"), options.get("roi")
+    path, scale = options.get("depth"), options.get("depth_scale", 0.001)
     for opened in open_sources([source], options.get("topic")):
         lens = Lens(choose_camera(K, camera, opened), options.get("K_size"), options.get("crop"))
-        if options.get("depth") is not None and opened.count != 1:
+        if path is not None and opened.count != 1:
             problem = f"--depth with {opened.count or 'many'} images"
             fix = "pass only the image that the depth belongs to"
             raise UserError(problem, "one image", fix)
+        read_depth = None if path is None else partial(lens.read_depth, path, scale)
         tracker = PoseTracker(estimator) if options.get("track") else None
+        given, cropped = (estimator, tracker, shapes), lens.crop is not None
         for frame in opened.frames(stride):
-            yield replace(_process(estimator, tracker, frame, lens, options), shapes=shapes)
+            yield estimate_frame(*given, frame, lens.undistort, cropped, read_depth, distances, roi)
 
 
-def _process(
+def estimate_frame(
     estimator: PoseEstimator,
     tracker: PoseTracker | None,
+    shapes: Mapping[str, Shape],
     frame: CameraFrame,
-    lens: Lens,
-    options: StreamOptions,
+    undistort: Callable[[RGBImage], tuple[RGBImage, CameraMatrix]],
+    cropped: bool,
+    read_depth: Callable[[CameraMatrix], Depth] | None = None,
+    distances: Distances | None = None,
+    roi: Region | None = None,
 ) -> PoseResult:
     """Detect the parts in one frame or, with a tracker, track them.
 
     Args:
-        estimator: Estimator with the minimum score of the options.
+        estimator: Estimator with the minimum score of the result.
         tracker: Tracker of the source; None without tracking.
+        shapes: Shape of each part, for drawing.
         frame: Frame of the source.
-        lens: Camera of the source.
-        options: Options of :func:`stream`.
+        undistort: Returns an image without lens distortion, and its K.
+        cropped: Whether the image may be a crop; see :meth:`PoseEstimator.predict`.
+        read_depth: Returns the depth image for K; not with a tracker, like ``distances`` and
+            ``roi`` of :meth:`PoseEstimator.predict`.
+        distances: Expected depths of the parts.
+        roi: Region to process.
     """
-    before, start = dict(estimator.spent_ms), time.perf_counter()
-    image, K = lens.undistort(frame.image)
-    estimator.spent_ms["pre"] += 1000 * (time.perf_counter() - start)
-    cropped, identities = lens.crop is not None, None
+    before, identities = dict(estimator.spent_ms), None
+    with estimator.timed("pre"):
+        image, K = undistort(frame.image)
     if tracker is None:
-        path, scale = options.get("depth"), options.get("depth_scale", 0.001)
-        depth = None if path is None else lens.read_depth(path, scale, K)
-        distances, roi = options.get("distances"), options.get("roi")
+        depth = None if read_depth is None else read_depth(K)
         candidates = estimator.candidates(image, K, None, depth, distances, roi, cropped)
         detections, weaker = estimator.split(candidates)
     else:
+        tracker.estimator = estimator
         tracks, weaker = tracker.track(image, K, cropped), tracker.weaker
         detections = [track.detection for track in tracks]
         identities = [track.identity for track in tracks]
-    return PoseResult(
-        image,
-        K,
-        detections,
-        elapsed_by_step(before, estimator.spent_ms),
-        frame.name,
-        frame.number,
-        frame.time,
-        identities,
-        weaker=weaker,
-        min_score=estimator.min_score,
-    )
+    speed = elapsed_by_step(before, estimator.spent_ms)
+    source, threshold = (frame.name, frame.number, frame.time), estimator.min_score
+    return PoseResult(image, K, detections, speed, *source, identities, shapes, weaker, threshold)

@@ -7,7 +7,6 @@ and continues with the next image.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -19,8 +18,9 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
 from dopepp.inference.frames.ros import camera_of_info, decode_image, is_cropped, is_rectified
-from dopepp.inference.pose_result import PoseResult, elapsed_by_step, make_shape
+from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
+from dopepp.inference.stream import estimate_frame
 from dopepp.inference.tracker import PoseTracker
 from dopepp.recovery.detection import Detection
 
@@ -210,23 +210,8 @@ class Worker:
         """
         check_size(camera, frame.image)
         estimator = self._estimator(self.settings.refine).reporting(self.settings.confidence)
-        before, start = dict(estimator.spent_ms), time.perf_counter()
-        image = camera.undistorted(frame.image)
-        estimator.spent_ms["pre"] += 1000 * (time.perf_counter() - start)
-        if self._tracker is None:
-            candidates = estimator.candidates(image, camera.K, cropped=cropped)
-            (detections, weaker), ids = estimator.split(candidates), None
-        else:
-            self._tracker.estimator = estimator
-            tracks, weaker = self._tracker.track(image, camera.K, cropped), self._tracker.weaker
-            detections = [track.detection for track in tracks]
-            ids = [track.identity for track in tracks]
-        speed = elapsed_by_step(before, estimator.spent_ms)
-        source = frame.name, frame.number, frame.time
-        threshold = estimator.min_score
-        return PoseResult(
-            image, camera.K, detections, speed, *source, ids, self._shapes, weaker, threshold
-        )
+        given = estimator, self._tracker, self._shapes, frame
+        return estimate_frame(*given, lambda image: (camera.undistorted(image), camera.K), cropped)
 
     def _checked_frame(self, frame_id: str, info: Any | None, topic: str) -> str:
         """Return the name of the poses' frame; warn if it does not contain "optical"."""
