@@ -128,11 +128,12 @@ class PoseEstimator:
 
         Args:
             path: Checkpoint, or exported network.
-            device: See the class.
-            refine: See the class.
-            parts: See the class.
-            max_ms: See the class.
-            scale_error: See the class.
+            device: Device that runs the network, e.g. ``cpu`` or ``cuda``.
+            refine: ``region``, ``depth`` or both (default: no refinement).
+            parts: The checkpoint's parts with other meshes (default: the meshes in the checkpoint).
+            max_ms: Time limit for the refinement of an image, milliseconds (default: none).
+            scale_error: Largest relative error of the parts' size or of the focal length (default:
+                0.005).
             extensions: Packages whose classes the checkpoint may name
                 (:mod:`dopepp.core.extensions`). They stay enabled in this process.
 
@@ -167,9 +168,10 @@ class PoseEstimator:
                 degrees.
             name: Name of the part (default: the name of the file).
             symmetries: ``auto`` finds them on the mesh; None: the part has none.
-            refine: See the class; must include ``region``, which also verifies the poses.
-            max_ms: See the class.
-            scale_error: See the class (default: 0.001).
+            refine: ``region``, which also verifies the poses, or ``region`` and ``depth``.
+            max_ms: Time limit for the refinement of an image, milliseconds (default: none).
+            scale_error: Largest relative error of the part's size or of the focal length (default:
+                0.001).
 
         Raises:
             UserError: The mesh or an option is invalid, or the working distance is missing.
@@ -182,7 +184,7 @@ class PoseEstimator:
         )
 
     def refining(self, refine: Refine | None, parts: Sequence[Part] | None = None) -> PoseEstimator:
-        """Return an estimator with the same network and another refinement; see the class."""
+        """Return an estimator with the same network and another refinement or other meshes."""
         refining = copy.copy(self)
         refining._refine_by(refine, parts or self.parts)
         return refining
