@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from dopepp.parts.part import Mesh
+from dopepp.parts.mesh import Mesh
 
 
 def mesh_of(*solids, scale=1.0):

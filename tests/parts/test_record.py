@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 
 from dopepp.core.errors import UserError
 from dopepp.parts import Part, make_part, servoholder
-from dopepp.parts.part import MAX_LIGHT_FACES, MAX_POINTS, Mesh
+from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import MAX_LIGHT_FACES, MAX_POINTS
 
 
 def symmetric_part():

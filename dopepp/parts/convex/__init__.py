@@ -17,7 +17,8 @@ from scipy.spatial import ConvexHull
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import cache_folder, write_file
-from dopepp.parts.part import Mesh, Part
+from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Part
 
 Piece = Float[np.ndarray, "vertices 3"]
 

@@ -1,4 +1,4 @@
-"""Measures of triangles: areas, samples, the largest distance, a hash, and distances to a surface.
+"""Meshes, and measures of triangles: areas, samples, diameters, a hash, distances to a surface.
 
 The functions take arrays, so that triangles can be measured before they are checked. The modules of
 this package read mesh files.
@@ -7,7 +7,8 @@ this package read mesh files.
 from __future__ import annotations
 
 import hashlib
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import scipy  # SciPy loads its submodules on first use
@@ -36,16 +37,32 @@ _NUM_NEIGHBOURS: Final = 6
 be the nearest triangle."""
 
 
-class RawMesh(NamedTuple):
-    """Triangles in the unit of a file (None: not stated); see :class:`~dopepp.parts.part.Mesh`."""
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the object frame.
+
+    Attributes:
+        vertices: Positions in metres, float64.
+        faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
+        uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
+        texture: RGB texture image, first row on top.
+        colours: sRGB of each vertex, 0 – 255; None with a texture.
+        normals: Normal of each vertex as in the file, of any length; may be zero or not finite.
+    """
 
     vertices: Vertices
     faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
     texture: RGBImage | None = None
-    unit: str | None = None
     colours: Colours | None = None
     normals: Float[np.ndarray, "vertices 3"] | None = None
+
+
+@dataclass(frozen=True)
+class RawMesh(Mesh):
+    """Triangles as read from a file, in its unit, before any check."""
+
+    unit: str | None = None  # as stated by the file; None: not stated
 
 
 def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:

@@ -17,6 +17,7 @@ import re
 import struct
 import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,7 +62,8 @@ def read_stl(path: Path) -> RawMesh:
     if is_text and b"\0" in data:  # never in text
         stated = f"{num_triangles} triangles, {promised} bytes"
         raise ValueError(f"{len(data)} bytes, but the header states {stated}")
-    (vertices, faces, *_), _ = read_scene(data, "stl")
+    mesh = read_scene(data, "stl")[0]
+    vertices, faces = mesh.vertices, mesh.faces
     # trimesh omits a text file's last solid if it is truncated.
     facets = re.finditer(rb"\bfacet\s+normal\b", data, re.IGNORECASE)
     begun = sum(1 for _ in facets) if is_text else len(faces)
@@ -103,7 +105,7 @@ def read_3mf(path: Path) -> RawMesh:
     if unit not in UNITS_3MF:
         problem, allowed = f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF)
         raise UserError(problem, allowed, "export the mesh in millimetres")
-    return mesh._replace(unit=UNITS_3MF[unit])
+    return replace(mesh, unit=UNITS_3MF[unit])
 
 
 def _count_pieces(model: bytes) -> int:
@@ -172,7 +174,7 @@ def read_glb(path: Path) -> RawMesh:
     # trimesh would open images of any kind; texture coordinates only need a material.
     header |= {"images": [], "materials": [{} for _ in header.get("materials", ())]}
     mesh, _ = read_scene(_packed(header, binary), "glb")
-    return mesh._replace(uv=None if texture is None else mesh.uv, texture=texture, unit="m")
+    return replace(mesh, uv=None if texture is None else mesh.uv, texture=texture, unit="m")
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -10,7 +10,7 @@ import io
 import logging
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,11 +19,11 @@ from jaxtyping import Bool, Float, Int
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_limited
-from dopepp.parts.mesh import Faces, Points, RawMesh, Vertices, connected, face_areas, weld
+from dopepp.parts.mesh import Faces, Mesh, Points, RawMesh, Vertices, connected, face_areas, weld
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
 from dopepp.parts.mesh.obj import read_obj, read_off
 from dopepp.parts.mesh.ply import read_ply
-from dopepp.parts.part import UNITS, Mesh, Part, make_part
+from dopepp.parts.part import UNITS, Part, make_part
 
 logger = logging.getLogger(__name__)
 ASSUMED_UNIT: Final = "mm"  # Unit of most CAD files that cannot state a unit
@@ -86,7 +86,7 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         raise _damage_error(path, f"{kind}{error}") from error
     applied = unit or raw.unit or ASSUMED_UNIT
-    mesh = _clean_mesh(path, raw._replace(vertices=UNITS[applied] * raw.vertices))
+    mesh = _clean_mesh(path, replace(raw, vertices=UNITS[applied] * raw.vertices))
     if unit is None and raw.unit is None:
         logger.warning("%s states no unit: assuming %s (override with unit=…)", path, ASSUMED_UNIT)
     elif raw.unit not in (None, applied):
@@ -139,7 +139,7 @@ def read_points(path: Path) -> Points:
 
 def _clean_mesh(path: Path, raw: RawMesh) -> Mesh:
     """Check a mesh, drop zero-area triangles and unused vertices, and orient the triangles."""
-    vertices, faces, uv, texture, *_ = raw
+    vertices, faces, uv = raw.vertices, raw.faces, raw.uv
     if not len(vertices) or not len(faces):
         raise _damage_error(path, f"{len(vertices)} vertices and {len(faces)} faces")
     for values in (vertices, uv):
@@ -168,7 +168,7 @@ def _clean_mesh(path: Path, raw: RawMesh) -> Mesh:
         vertices=vertices,
         faces=flip_faces(faces, inverted).astype(np.int32),
         uv=None if uv is None else np.asarray(uv, np.float64)[used],
-        texture=texture,
+        texture=raw.texture,
         colours=None if raw.colours is None else raw.colours[used],
         normals=None if raw.normals is None else raw.normals[used],
     )

@@ -102,9 +102,9 @@ def test_agrees_with_trimesh(tmp_path, encoding):
     ball.visual.vertex_colors = np.arange(4 * len(ball.vertices)).reshape(-1, 4) % 256
     ball.export(tmp_path / "a.ply", encoding=encoding)
     expected = trimesh.load(tmp_path / "a.ply", process=False)
-    vertices, faces, *_ = read_ply(tmp_path / "a.ply")
-    np.testing.assert_allclose(vertices, expected.vertices, rtol=1e-7)
-    np.testing.assert_array_equal(faces, expected.faces)
+    mesh = read_ply(tmp_path / "a.ply")
+    np.testing.assert_allclose(mesh.vertices, expected.vertices, rtol=1e-7)
+    np.testing.assert_array_equal(mesh.faces, expected.faces)
 
 
 @pytest.mark.parametrize("form", FORMATS)
