@@ -33,21 +33,27 @@ from dopepp.recovery.detection import Detection
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
 
-AROUND: Final = 0.5  # margin around a doubtful part in which it is searched, share of its extent
-NEAR: Final = 0.5  # largest distance between the centres of a track and its detection, diameters
-ELSEWHERE: Final = 0.1  # mean keypoint distance above which track and detection disagree, diameters
-OUTVOTED: Final = 2  # consecutive disagreeing detections after which a track moves to them
+SEARCH_MARGIN: Final = (
+    0.5  # margin around a doubtful part in which it is searched, share of its extent
+)
+MAX_MATCH_DISTANCE: Final = (
+    0.5  # largest distance between the centres of a track and its detection, diameters
+)
+MAX_DIFFERENCE: Final = (
+    0.1  # mean keypoint distance above which track and detection disagree, diameters
+)
+MAX_DISAGREEMENTS: Final = 2  # consecutive disagreeing detections after which a track moves to them
 # Share of the usual agreement below which a track is doubtful. On rendered sequences, the share was
 # 0.97 at correct poses, and 0.5 at poses that an occluder had displaced.
-DOUBTFUL: Final = 0.8
+MIN_USUAL_SHARE: Final = 0.8
 # Agreement below which a pose is rejected (unless the first pose agreed less): half of a wrong
 # pose's outline may coincide with other edges.
-TRUSTED: Final = 0.6
-SURE: Final = 0.85  # agreement below which the network is run every OFTEN frames
-OFTEN: Final = 5
-USUAL: Final = 0.1  # weight of a frame in the usual agreement
-PATIENCE: Final = 6  # consecutive doubtful frames in which a part moves on before it is lost
-FORGOTTEN: Final = 300  # frames after which a lost part is no longer searched
+MIN_AGREEMENT: Final = 0.6
+CERTAIN: Final = 0.85  # agreement below which the network is run every CHECK_EVERY frames
+CHECK_EVERY: Final = 5
+USUAL_WEIGHT: Final = 0.1  # weight of a frame in the usual agreement
+MAX_DOUBTS: Final = 6  # consecutive doubtful frames in which a part moves on before it is lost
+MAX_UNSEEN: Final = 300  # frames after which a lost part is no longer searched
 
 Item = TypeVar("Item")  # type of a detection: in a camera, or in the world
 
@@ -162,13 +168,13 @@ class Tracker(ABC, Generic[Item]):
         elif doubtful:
             self._detect([state.estimate for state in doubtful])
         self._frame += 1
-        self._states = [state for state in self._states if state.unseen <= FORGOTTEN]
+        self._states = [state for state in self._states if state.unseen <= MAX_UNSEEN]
         least = self.estimator.min_score
         return [s.track() for s in self._states if not s.unseen and s.estimate.score >= least]
 
     def _is_doubtful(self, state: _State[Item]) -> bool:
         """Return whether the network must search a part that is lost, uncertain or contradicted."""
-        unsure = state.estimate.agreement < SURE and self._frame % OFTEN == 0
+        unsure = state.estimate.agreement < CERTAIN and self._frame % CHECK_EVERY == 0
         return bool(unsure or state.unseen or state.doubts or state.disagreements)
 
     def _follow(self, state: _State[Item]) -> None:
@@ -182,13 +188,13 @@ class Tracker(ABC, Generic[Item]):
                 if refined is None:
                     continue
                 agreement = refined.agreement
-                if agreement >= max(DOUBTFUL * state.usual, min(TRUSTED, state.usual)):
+                if agreement >= max(MIN_USUAL_SHARE * state.usual, min(MIN_AGREEMENT, state.usual)):
                     state.follow(motion.update(refined.pose, refined.covariance), refined)
-                    state.usual += USUAL * (agreement - state.usual)
+                    state.usual += USUAL_WEIGHT * (agreement - state.usual)
                     state.doubts = 0
                     return
                 rejected = agreement if rejected is None else rejected
-        if rejected is None or state.doubts == PATIENCE:
+        if rejected is None or state.doubts == MAX_DOUBTS:
             state.unseen += 1
             return
         state.follow(forecast, self._moved(state.estimate, forecast, rejected))
@@ -203,15 +209,15 @@ class Tracker(ABC, Generic[Item]):
                 self._states.append(_State(identity, detected, motion, detected.agreement))
                 continue
             tracked = state.estimate
-            if detected.agreement < min(TRUSTED, state.usual):
+            if detected.agreement < min(MIN_AGREEMENT, state.usual):
                 continue
             if state.unseen or (state.doubts and detected.agreement > tracked.agreement):
                 state.move_to(detected, motion)
-            elif self._keypoint_distance(tracked, detected) <= ELSEWHERE:
+            elif self._keypoint_distance(tracked, detected) <= MAX_DIFFERENCE:
                 state.disagreements = 0
             elif detected.agreement >= tracked.agreement:
                 state.disagreements += 1
-                if state.disagreements == OUTVOTED:
+                if state.disagreements == MAX_DISAGREEMENTS:
                     state.move_to(detected, motion)
 
     def _assigned(
@@ -222,7 +228,10 @@ class Tracker(ABC, Generic[Item]):
         for name in self._cuboid_of:
             left = [detection for detection in detections if detection.object == name]
             states = [state for state in self._states if state.estimate.object == name]
-            for is_astray, limit in ((False, NEAR * self._diameters[name]), (True, math.inf)):
+            for is_astray, limit in (
+                (False, MAX_MATCH_DISTANCE * self._diameters[name]),
+                (True, math.inf),
+            ):
                 chosen = [s for s in states if bool(s.unseen or s.doubts) == is_astray]
                 tracked = np.reshape([s.estimate.pose[:3, 3] for s in chosen], (-1, 1, 3))
                 detected = np.reshape([item.pose[:3, 3] for item in left], (1, -1, 3))
@@ -302,7 +311,9 @@ def _estimate(detection: Detection) -> Estimate[Detection]:
 def region_around(detections: Sequence[Detection], image: RGBImage) -> Region | None:
     """Return a region with a margin around detections; None if it is almost outside the image."""
     points = np.concatenate([detection.keypoints for detection in detections])
-    margin = AROUND * max(np.ptp(detection.keypoints, axis=0).max() for detection in detections)
+    margin = SEARCH_MARGIN * max(
+        np.ptp(detection.keypoints, axis=0).max() for detection in detections
+    )
     limits = np.array(image.shape[1::-1])
     start = np.clip(np.floor(points.min(axis=0) - margin), 0, limits)
     end = np.clip(np.ceil(points.max(axis=0) + margin), 0, limits)

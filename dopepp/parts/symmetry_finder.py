@@ -21,10 +21,11 @@ from dopepp.geometry.rotation import (
     rotation_vector_to_matrix,
 )
 from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group, rotations_about
-from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
-from dopepp.parts.part import Mesh
+from dopepp.parts.mesh import Mesh, Points, SurfaceTree, half_sphere, largest_distance
 
-_ROUGH: Final = 0.06  # Mean distance that excludes a symmetry within 2.6° of the axis, diameters
+_MAX_MEAN_DISTANCE: Final = (
+    0.06  # Mean distance that excludes a symmetry within 2.6° of the axis, diameters
+)
 _HUBER_WIDTH: Final = 0.02
 """Distance above which the loss of a point is linear (Huber), diameters: a feature may lack a
 counterpart."""
@@ -182,7 +183,7 @@ class Candidates:
         index = np.flatnonzero(possible)
         moved = self._rough_probes @ np.swapaxes(R[index], 1, 2)
         rough = self._surface.distances(moved, neighbours=1).mean(axis=1)
-        index, rough = index[rough < _ROUGH], rough[rough < _ROUGH]
+        index, rough = index[rough < _MAX_MEAN_DISTANCE], rough[rough < _MAX_MEAN_DISTANCE]
         taken: list[Vector] = []
         for number in index[np.argsort(rough, kind="stable")]:
             axis = self._axes[number]

@@ -25,7 +25,7 @@ from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, make_detection
-from dopepp.recovery.search import CLEAR, Depths, PosedMaps, PoseSearch
+from dopepp.recovery.search import MIN_BELIEF, Depths, PosedMaps, PoseSearch
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -151,7 +151,7 @@ def recover_batch(
             for group, result in instances:
                 detection = make_detection(group, result, cuboid, camera, name, chosen)
                 is_probable = detection is not None and detection.score >= PROBABLE
-                is_clear = group.score[CENTROID] >= CLEAR
+                is_clear = group.score[CENTROID] >= MIN_BELIEF
                 if reach is not None and is_clear and not is_probable:
                     if search is None:
                         maps = beliefs.float().cpu().numpy()

@@ -37,7 +37,7 @@ from dopepp.recovery.association import KeypointGroup, ObjectPeaks
 Beliefs = Float[np.ndarray, "9 height width"]
 Depths = tuple[float, float]  # nearest and farthest depth, metres
 
-CLEAR: Final = 0.3  # belief of a centroid's peak from which a pose is searched
+MIN_BELIEF: Final = 0.3  # belief of a centroid's peak from which a pose is searched
 ROTATION_DEVIATION: Final = 0.3  # standard deviation of a searched rotation, radians
 DEPTH_DEVIATION: Final = 0.08  # standard deviation of a searched depth, share of the depth
 CENTROID_DEVIATION: Final = 0.4  # standard deviation of a centroid peak's position, cells

@@ -10,7 +10,7 @@ from dopepp.geometry.camera import make_transform, move_pose, project_keypoints,
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.motion import PERSISTENCE, SUDDEN, Motion, at_rest
-from dopepp.inference.tracker import FORGOTTEN, OFTEN, PATIENCE, PoseTracker
+from dopepp.inference.tracker import CHECK_EVERY, MAX_DOUBTS, MAX_UNSEEN, PoseTracker
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
 
@@ -150,10 +150,10 @@ def test_lost_part_is_forgotten(stage):
     stage.put("b", (0.1, 0.0, 0.3), part=servoholder())
     tracker.track(IMAGE, K)
     stage.hidden = {"a"}
-    for _ in range(FORGOTTEN + 2):
+    for _ in range(MAX_UNSEEN + 2):
         (track,) = tracker.track(IMAGE, K)
         assert track.detection.object == "servoholder"
-    assert stage.looks == FORGOTTEN + 2
+    assert stage.looks == MAX_UNSEEN + 2
     stage.hidden = set()
     assert [track.identity for track in tracker.track(IMAGE, K)] == [1]
 
@@ -205,11 +205,11 @@ def test_track_moves_only_to_a_detection_that_agrees_better(stage, tracker):
     elsewhere = make_transform(np.eye(3), np.array([0.0, 0.03, 0.3]))
     beside = replace(stage._detection("pivconnector", elsewhere), agreement=0.8)
     stage.candidates = lambda image, K, roi=None, cropped=False: [beside]
-    for _ in range(2 * OFTEN):
+    for _ in range(2 * CHECK_EVERY):
         (track,) = tracker.track(IMAGE, K)
     assert track.detection.T_cam_obj[1, 3] == pytest.approx(0.0, abs=1e-9)
     beside = replace(beside, agreement=0.9)
-    heights = [tracker.track(IMAGE, K)[0].detection.T_cam_obj[1, 3] for _ in range(OFTEN + 1)]
+    heights = [tracker.track(IMAGE, K)[0].detection.T_cam_obj[1, 3] for _ in range(CHECK_EVERY + 1)]
     assert max(heights) == pytest.approx(0.03)
 
 
@@ -222,7 +222,7 @@ def test_doubtful_part_continues_its_motion(stage):
     # A hand covers the part: half of the outline agrees, and the network detects nothing.
     stage.agreement, stage.unknown_to_network = 0.5, {"a"}
     stage.put("a", (0.047, 0.006, 0.3))
-    for number in range(1, PATIENCE + 1):
+    for number in range(1, MAX_DOUBTS + 1):
         (track,) = tracker.track(IMAGE, K)
         position = track.detection.T_cam_obj[:3, 3]
         assert 0.045 < position[0] < 0.045 + 0.005 * number
@@ -232,7 +232,7 @@ def test_doubtful_part_continues_its_motion(stage):
         for corner in track.detection.keypoints:
             assert np.all((corner > (x, y)) & (corner < (x + width, y + height)))
         assert width * height < IMAGE[..., 0].size / 2
-    assert stage.looks == 1 + PATIENCE
+    assert stage.looks == 1 + MAX_DOUBTS
     assert tracker.track(IMAGE, K) == []
     assert stage.roi is None
     stage.agreement, stage.unknown_to_network = 0.95, set()

@@ -13,9 +13,9 @@ from dopepp.recovery import recover
 from dopepp.recovery.detection import PROBABLE
 from dopepp.recovery.search import (
     CENTROID_DEVIATION,
-    CLEAR,
     DEPTH_DEVIATION,
     JOINT_STEP,
+    MIN_BELIEF,
     ROTATION_DEVIATION,
     PosedMaps,
     PoseSearch,
@@ -132,7 +132,7 @@ def test_only_uncertain_instances_have_an_alternative(scene):
 def test_no_pose_is_searched_at_a_weak_centroid(scene):
     scene, belief, field = scene
     belief[:5, :, 26:] = 0.0
-    belief[8] *= CLEAR - 0.02
+    belief[8] *= MIN_BELIEF - 0.02
     weak = recover(belief, field, scene.cuboids, scene.K, depths=[DEPTHS], min_score=0.0)
     assert [found.alternative for found in weak] == [None, None]
 

@@ -19,7 +19,7 @@ from dopepp.experiment.results.frame import (
     DELTA,
     FIELDS,
     MIN_DIFFERING,
-    WITHIN,
+    WITHIN_NOISE,
     Row,
     Value,
     make_frame,
@@ -173,7 +173,7 @@ def full_table(table: pd.DataFrame) -> list[Row]:
         if value.measure:
             row[title] = value.text
         if value.is_change:
-            verdict = WITHIN if value.within_noise else "beyond noise"
+            verdict = WITHIN_NOISE if value.within_noise else "beyond noise"
             texts = [*value.ends, verdict] if value.ends else [value.text] * 3
             row |= zip((f"{title} {end}" for end in ("low", "high", "verdict")), texts, strict=True)
         elif several and value.measure in FIELDS:

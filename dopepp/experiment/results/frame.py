@@ -33,7 +33,7 @@ DELTA: Final = "Δ "  # prefix of measures that are differences to the baseline
 COST_FORMS: Final = {"parameters": ",.0f", "GMACs": ".3f", "ms/frame": ".1f"}
 FIELDS: Final = {column.field: column for column in COLUMNS}
 NOMINAL: Final = np.linspace(0.05, 0.95, 19)  # probabilities of the measured covariance regions
-WITHIN: Final = "within noise"
+WITHIN_NOISE: Final = "within noise"
 MIN_DIFFERING: Final = fewest_differing(0.95)  # instances, for a significant difference
 
 # Headings of text columns.
@@ -112,7 +112,7 @@ class Value(NamedTuple):
     def summary(self) -> str:
         """Mean ± deviation, or Δ with its interval and a mark if not significant."""
         if self.is_change and self.ends:
-            unsure = f" {WITHIN}" if self.within_noise else ""
+            unsure = f" {WITHIN_NOISE}" if self.within_noise else ""
             return f"{self.text} [{', '.join(self.ends)}]{unsure}"
         return self.text if math.isnan(self.deviation) else f"{self.text} ± {self.spread}"
 

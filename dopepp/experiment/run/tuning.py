@@ -83,7 +83,7 @@ MAX_INSTANCES: Final = 500
 MAX_LOST: Final = 0.01
 """Largest share of correct poses that a threshold above :data:`~.detection.PROBABLE` may reject."""
 
-SAME: Final = 0.005  # largest decrease of the average precision with fitted factors
+MAX_PRECISION_LOSS: Final = 0.005  # largest decrease of the average precision with fitted factors
 
 HELD_OUT: Final[tuple[Literal["val"], Literal["test"]]] = ("val", "test")
 
@@ -204,7 +204,7 @@ def _chosen_factors(
     rate: float,
     old: RecoveryOptions,
 ) -> tuple[RecoveryOptions, ScoredDetections, str]:
-    """Fit distance and covariance factor; keep the old ones if they raise AP by over ``SAME``.
+    """Fit distance and covariance factor, unless they lower AP by over ``MAX_PRECISION_LOSS``.
 
     AP is measured on the estimator's final poses, because a wrong covariance of the network's poses
     misleads the refinement. The score of network poses is fitted for both.
@@ -228,7 +228,7 @@ def _chosen_factors(
         shown = score_images(estimator, parts, validation)
         results.append((options, shown, shown.average_precision(shown.scores)))
     (new, shown_new, fitted), (same, shown_same, former) = results
-    if fitted >= former - SAME:
+    if fitted >= former - MAX_PRECISION_LOSS:
         return new, shown_new, ""
     text = ", ".join(f"{name}={value:.3g}" for name, value in factors.items())
     kept = f"AP {former:.3f} on validation images with the old factors, {fitted:.3f} with {text}"

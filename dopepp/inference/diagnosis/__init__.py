@@ -33,10 +33,12 @@ from dopepp.parts.size import is_plausible, size_in_words
 
 __all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
 
-SAME: Final = 1.05  # ratio of two sizes of a part that simplification of its mesh may cause
+MAX_SIZE_RATIO: Final = (
+    1.05  # ratio of two sizes of a part that simplification of its mesh may cause
+)
 # Grey level (0 to 255) of highlights below which an image is dark: above 105 in good renders, 35 to
 # 60 at 1/16 of the light.
-DARK: Final = 70.0
+MIN_HIGHLIGHT: Final = 70.0
 
 # Shares of white pixels above which the image, or the region of the part, is overexposed: up to 0.1
 # in good renders, 0.2 to 0.8 with eight times the light.
@@ -44,7 +46,7 @@ CLIPPED, CLIPPED_PART = 0.25, 0.15
 
 # Width of edges above which an image is blurred, pixels of the network's input. A blur of two
 # pixels (1.1 to 2) is harmless. At a blur of five (3.2 to 4.7), a quarter of the parts is missed.
-BLURRED: Final = 2.5
+MAX_EDGE_WIDTH: Final = 2.5
 
 # K is reported as wrong if a focal length that differs by the factor FOCAL reduces the keypoint
 # error by the factor GAIN, and the standard deviation of its logarithm is below CERTAIN. The error
@@ -54,10 +56,12 @@ FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 
 # Belief at a part's centre from which the part is partly visible: 0.4 to 0.8 for half-occluded
 # parts, mostly below 0.2 on images without the part.
-PARTLY: Final = 0.3
+MIN_BELIEF: Final = 0.3
 MIN_SCORE: Final = 0.03  # of a correct detection; untuned networks' false positives score lower
-OFF: Final = 0.08  # largest reprojection error, share of the part's length: up to 0.06 if good
-AGREEING: Final = 0.6  # smallest share of the outline that agrees: 0.68 to 1 in good renders
+MAX_ERROR_SHARE: Final = (
+    0.08  # largest reprojection error, share of the part's length: up to 0.06 if good
+)
+MIN_AGREEMENT: Final = 0.6  # smallest share of the outline that agrees: 0.68 to 1 in good renders
 
 ABSENT: Final = (
     "check that the part is on the image, uncovered, and shows a side that training images showed; "
@@ -90,7 +94,7 @@ def part_size(case: Case) -> Diagnosis:
         if given.mesh is not None:
             extents = np.ptp(given.mesh.vertices, axis=0)
             ratio = float(np.linalg.norm(extents) / np.linalg.norm(learned))
-            if not _near(ratio, SAME):
+            if not _near(ratio, MAX_SIZE_RATIO):
                 mesh = f"its mesh {size_in_words(extents)}, {ratio:.3g} times that"
                 return Diagnosis("part", f"{sizes[-1]}, and {mesh}", _unit_fix(ratio))
         if not is_plausible(part):
@@ -108,7 +112,7 @@ def exposure(case: Case) -> Diagnosis:
     if case.detection is not None:
         near = clipped_share(case.around())
         sentence += f", {near:.0%} around the part"
-    if brightest < DARK:
+    if brightest < MIN_HIGHLIGHT:
         return Diagnosis("exposure", f"too dark: {sentence}", "expose longer, or add light")
     if white > CLIPPED or near > CLIPPED_PART:
         return Diagnosis("exposure", f"too bright: {sentence}", "expose less, or reduce the light")
@@ -124,7 +128,7 @@ def sharpness(case: Case) -> Diagnosis:
     width_image = width / case.box.scale_x
     owner = "network's" if case.estimator.has_network else "templates'"
     sentence = f"edges {width_image:.1f} pixels wide, {width:.1f} in the {owner} {size}"
-    if width <= BLURRED:
+    if width <= MAX_EDGE_WIDTH:
         return Diagnosis("sharpness", sentence)
     fix = "focus on the part; if it or the camera moves, use a shorter exposure"
     return Diagnosis("sharpness", f"blurred: {sentence}", fix)
@@ -189,8 +193,8 @@ def visibility(case: Case) -> Diagnosis:
         problem = f"the best candidate is probably not {name}: {sentence}"
         return Diagnosis("visibility", problem, ABSENT)
     beliefs = case.strongest_beliefs()
-    centre, count = float(beliefs[CENTROID]), int((beliefs > PARTLY).sum())
-    if centre < PARTLY:
+    centre, count = float(beliefs[CENTROID]), int((beliefs > MIN_BELIEF).sum())
+    if centre < MIN_BELIEF:
         belief = f"the belief of its centre is {centre:.2g} at most"
         return Diagnosis("visibility", f"{name} is not detected, {belief}", ABSENT)
     return Diagnosis(
@@ -228,7 +232,7 @@ def pose(case: Case) -> Diagnosis:
     sentence = f"{name} has a reprojection error of {detection.reprojection_error_px:.1f} pixels"
     if not case.estimator.has_network:
         sentence = f"{name} is {case.length_px:.0f} pixels long"
-    if share > OFF:
+    if share > MAX_ERROR_SHARE:
         fix = "check K and the mesh; if both are correct, train longer or with more such images"
         return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)
     if refined is None:
@@ -239,7 +243,7 @@ def pose(case: Case) -> Diagnosis:
         return Diagnosis("pose", sentence, fix if case.estimator.refiner is not None else "")
     sentence += f", {refined.agreement:.0%} of its outline agrees"
     fix = "uncover the part; check that the mesh is this part's (--part)"
-    return Diagnosis("pose", sentence, "" if refined.agreement >= AGREEING else fix)
+    return Diagnosis("pose", sentence, "" if refined.agreement >= MIN_AGREEMENT else fix)
 
 
 # Faults that a check finds may also explain the failures of later checks.
@@ -279,6 +283,6 @@ def _unit_fix(ratio: float) -> str:
     """Return the remedy for a mesh that is too large by a ratio, e.g. the ratio of two units."""
     for read, metres in UNITS.items():
         for actual, actual_metres in UNITS.items():
-            if read != actual and _near(ratio * actual_metres / metres, SAME):
+            if read != actual and _near(ratio * actual_metres / metres, MAX_SIZE_RATIO):
                 return f"it was read in {read} and is in {actual}: --unit {actual}"
     return "pass the mesh of the trained part: --part"

@@ -20,13 +20,13 @@ from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import Detection
 
 NEARER, FARTHER = 2.0, 4.0  # factors on the expected distances for a further search
-BELIEVED: Final = (0.4, 6)
+MIN_EVIDENCE: Final = (0.4, 6)
 """Smallest mean belief and number of keypoints of a detection outside the expected distances."""
 
 MIN_PX: Final = 24  # smallest side of an image whose sharpness can be measured
 NARROWEST: Final = 0.5  # pixels: narrower edges cannot be distinguished
 FEWEST: Final = 8  # smallest number of edge pixels for a measurement of sharpness
-STRONG: Final = 0.3
+MIN_GRADIENT: Final = 0.3
 """Share of the strongest gradient above which an edge is measured: weaker edges are shading, noise
 or out-of-focus background."""
 
@@ -95,7 +95,7 @@ class Case:
         detection = detections[0] if detections else None
         if not self.estimator.has_network:
             return detection
-        belief, keypoints = BELIEVED
+        belief, keypoints = MIN_EVIDENCE
         if detection is None or not np.isfinite(detection.keypoints).all():
             return None
         is_believed = detection.belief >= belief and num_keypoints(detection) >= keypoints
@@ -193,7 +193,7 @@ def edge_width(image: RGBImage) -> float | None:
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     fine, coarse = _gradient(grey, 1.0), _gradient(grey, 2.0)
-    least = max(STRONG * float(np.percentile(fine, 99.5)), 2 * _noise(grey), 1.0)
+    least = max(MIN_GRADIENT * float(np.percentile(fine, 99.5)), 2 * _noise(grey), 1.0)
     edges = (fine >= cv2.dilate(fine, np.ones((3, 3)))) & (fine > least)
     if np.count_nonzero(edges) < FEWEST:
         return None

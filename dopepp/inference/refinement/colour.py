@@ -27,12 +27,12 @@ SMALLEST_PX: Final = 12  # length below which a part shows no outline
 MARGIN: Final = 0.35  # margin of a crop, share of the part's extent
 EDGE_PX: Final = 6.0  # additional margin: the smallest search distance of an outline
 STEPS: Final = 16  # bins per channel
-UNSEEN: Final = 0.3  # initial count of each colour in both histograms
+INITIAL_COUNT: Final = 0.3  # initial count of each colour in both histograms
 
-KNOWN: Final = 100.0
+GLOBAL_WEIGHT: Final = 100.0
 """Weight of the histogram of all tiles in each tile's histogram, in counted pixels."""
 
-MOST: Final = 3.0
+MAX_LOG_ODDS: Final = 3.0
 """Bound of the log odds (20 to 1), because neighbouring pixels are not independent."""
 
 LONGEST_PX: Final = 250  # length above which the pixels of a crop are subsampled
@@ -236,7 +236,7 @@ def _tables(counts: Array, tables: Array) -> None:
     total, near = np.empty((2, STEPS**3), np.float32), np.empty((2, STEPS**3), np.float32)
     for side in range(2):
         for k in range(STEPS**3):
-            total[side, k] = UNSEEN
+            total[side, k] = INITIAL_COUNT
         for i in range(tiles):
             for j in range(tiles):
                 _blur(counts[side, i, j])
@@ -244,7 +244,7 @@ def _tables(counts: Array, tables: Array) -> None:
                     total[side, k] += counts[side, i, j, k]
     sums = _sums(total[0], total[1])
     for side in range(2):
-        factor = KNOWN / sums[side]
+        factor = GLOBAL_WEIGHT / sums[side]
         for k in range(STEPS**3):
             total[side, k] *= factor
     for i in range(tiles):
@@ -265,7 +265,7 @@ def _tables(counts: Array, tables: Array) -> None:
                     tables[i, j, k] = tables[i, j, k - 1]
                     continue
                 odds = level + math.log(near[0, k] / near[1, k])
-                tables[i, j, k] = min(max(odds, -MOST), MOST)
+                tables[i, j, k] = min(max(odds, -MAX_LOG_ODDS), MAX_LOG_ODDS)
 
 
 @compiled()

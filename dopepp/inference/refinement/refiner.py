@@ -66,11 +66,11 @@ if TYPE_CHECKING:
 
 TERMS: Final = ("region", "depth")
 
-LOOSER: Final = 3.0
+DEVIATION_FACTOR: Final = 3.0
 """Factor on the standard deviations of a network's pose. Its covariance was fitted to images like
 the training images; errors are larger on other images."""
 
-FEW: Final = 4  # number of keypoints that determine a pose
+MIN_KEYPOINTS: Final = 4  # number of keypoints that determine a pose
 NUM_QUADRUPLES: Final = 40  # nine keypoints have 126 quadruples
 
 Refine = str | Sequence[str]  # name or names in TERMS
@@ -134,7 +134,7 @@ class Refiner:
         if not is_tracked and np.isfinite(detection.peaks).any():  # templates have no peaks
             # A tracker predicts how far a part moves, but a network's covariance may be too small.
             starts = partial(poses_of_four, cuboid, detection.peaks, K)
-            prior = LOOSER**2 * covariance
+            prior = DEVIATION_FACTOR**2 * covariance
         refined = refiner.refine(image, K, T_cam_obj, prior, depth, is_tracked, starts)
         detection = replace(detection, start=(T_cam_obj, prior))
         if refined.covariance is None:
@@ -350,7 +350,7 @@ def poses_of_four(
         peaks: Measured keypoints, pixels; NaN if missing.
         K: Camera matrix.
     """
-    quadruples = list(combinations(np.flatnonzero(np.isfinite(peaks).all(axis=1)), FEW))
+    quadruples = list(combinations(np.flatnonzero(np.isfinite(peaks).all(axis=1)), MIN_KEYPOINTS))
     order = np.random.default_rng(0).permutation(len(quadruples))[:NUM_QUADRUPLES]
     poses = []
     for number in order:

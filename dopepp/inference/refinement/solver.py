@@ -24,7 +24,7 @@ NormalEquations = tuple[PoseMatrix, Float[np.ndarray, "6"]]
 """H and g of H ξ = g, where ξ is rotation vector (radians) and shift (metres), in camera axes."""
 
 DAMPING: Final = 1e-6  # share of each unknown's information; small, as the prior determines all
-ARRIVED: Final = 0.1  # standard deviations; a shorter step ends the descent
+MIN_STEP: Final = 0.1  # standard deviations; a shorter step ends the descent
 
 # Standard deviations of a pose without covariance: radians, and diameters across and along the
 # viewing ray. An image hardly determines the distance.
@@ -141,7 +141,7 @@ def descend(
         T_cam_obj: Start pose, metres.
         prior: Distribution of the pose.
         terms: Measurement terms, added in this order.
-        steps: Largest number of steps; steps shorter than :data:`ARRIVED` end the descent.
+        steps: Largest number of steps; steps shorter than :data:`MIN_STEP` end the descent.
 
     Returns:
         The solution, or None if a term has no usable measurement.
@@ -165,6 +165,6 @@ def descend(
             information, gradient = information + equations[0], gradient + equations[1]
         solve_damped(information, -gradient, DAMPING, step)
         pose = move_pose(pose, step)
-        if step @ information @ step < ARRIVED**2:
+        if step @ information @ step < MIN_STEP**2:
             break
     return Solution(pose, information, [(H, g - H @ step) for H, g in last])

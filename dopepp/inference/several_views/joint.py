@@ -22,7 +22,7 @@ from dopepp.inference.refinement.joint_refinement import (
     PosedImage,
     rotate_covariance,
 )
-from dopepp.inference.refinement.refiner import LOOSER, Refiner
+from dopepp.inference.refinement.refiner import DEVIATION_FACTOR, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import PoseMatrix, Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
@@ -37,14 +37,14 @@ AGREEING: Final = 0.7
 correct poses, the agreement is above 0.9. If a camera's position has an error of 4 mm at a distance
 of 20 cm, the agreement is below 0.7 in one view."""
 
-WEAKER: Final = (0.5, 0.15)
+SUPPORT_LIMITS: Final = (0.5, 0.15)
 """Factor on the probability and decrease of the agreement of a view's detection, down to which the
 view also supports the joint pose."""
 
 CONSISTENT: Final = 4.5
 """Largest Mahalanobis distance at which the covariances of two poses explain their difference."""
 
-AGAINST: Final = -1.5
+MIN_LOG_ODDS: Final = -1.5
 """Lower bound of a view's log odds, because the part may be occluded or hardly visible."""
 
 COINCIDENCE: Final = 1.5
@@ -142,7 +142,7 @@ class JointEstimator:
         while len(selected) > 1 and (selected, len(observations)) not in tried:
             tried.append((selected, len(observations)))
             start = geometry.mean([observation.pose for observation in observations])
-            search_range = Prior(start.T_cam_obj, start.information / LOOSER**2)
+            search_range = Prior(start.T_cam_obj, start.information / DEVIATION_FACTOR**2)
             views_with_observation = {observation.view for observation in observations}
             numbers = sorted(selected)
             starts = [item.start for item in observations if item.view in selected]
@@ -297,7 +297,7 @@ class JointEstimator:
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
         if observation is not None and not original.kept:
-            factor, decrease = WEAKER
+            factor, decrease = SUPPORT_LIMITS
             least = min(least, factor * (original.probability or 0.0))
             least_share = min(least_share, (original.agreement or 0.0) - decrease)
         is_shown = agreement is not None and probability >= least and share >= least_share
@@ -318,7 +318,7 @@ class JointEstimator:
         best = max((item.detection for item in observations), key=lambda detection: detection.score)
         single_odds, odds = log_odds(best.probability or 0.0), 0.0
         for item in evidence:
-            seen = max(AGAINST, log_odds(item.probability))
+            seen = max(MIN_LOG_ODDS, log_odds(item.probability))
             if item.detection is best:
                 odds += single_odds
             elif item.status != "outside":

@@ -27,7 +27,7 @@ from dopepp.robot.grasping.cell import HOME, JOINTS, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
 from dopepp.robot.grasping.grasps import TILTS, find_grasps
 from dopepp.robot.grasping.planner import (
-    LOW,
+    MAX_HEIGHTS,
     Arm,
     Joints,
     Planner,
@@ -324,7 +324,7 @@ class Trials:
             return Attempt(scene, self._record(scene, source, observation, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
         parts, joints = observation.parts[:MAX_OBSTACLES], observation.joints
-        low = LOW[self.task.layout]
+        low = MAX_HEIGHTS[self.task.layout]
         poses = (align_with_bench(part.T_base_obj, hull, bench, low) for part in parts)
         flat = [replace(part, T_base_obj=pose) for part, pose in zip(parts, poses, strict=True)]
         planner = self._planner(scene)

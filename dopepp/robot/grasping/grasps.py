@@ -35,11 +35,12 @@ from dopepp.core.validation import STRICT, Range, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.part import Mesh, Part
+from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Part
 from dopepp.virtual.body import make_body
 
 MAX_GRASPS: Final = 1000
-WIDEST: Final = 0.085  # largest opening of the fingers (2F-85), metres
+MAX_OPENING: Final = 0.085  # largest opening of the fingers (2F-85), metres
 CLEARANCE: Final = 0.006  # preferred distance of each descending finger from the part, metres
 PAD_HALF: Final = np.array([0.004, 0.011, 0.009375])
 """Half the thickness, width and length of a finger pad, metres. A finger has two pads in a row."""
@@ -49,19 +50,22 @@ INSERTIONS: Final = (0.009, 0.003, 0.0015)
 ABOVE_BENCH: Final = 0.001  # smallest distance of the pads' ends from the bench, metres
 PAIRS: Final = 1500  # sampled points for the search of pairs
 FACES: Final = 8  # number of the most common resting faces
-TRIED: Final = 100  # largest number of pairs that are tested on a face
+MAX_PAIRS: Final = 100  # largest number of pairs that are tested on a face
 SAMPLES: Final = 5000  # points that represent the surface in tests of collisions and contacts
-THINNEST: Final = 0.002  # smallest width of a grasp, metres
+MIN_WIDTH: Final = 0.002  # smallest width of a grasp, metres
 FRICTION_ANGLE: Final = math.radians(15.0)  # of normals to the closing; friction 0.6 holds 31°
 STEEPEST_CLOSING: Final = math.sin(math.radians(37.0))  # vertical component of a closing direction
 TILTS: Final = np.radians([0.0, 25.0, -25.0])  # of an approach about the closing direction
-ENOUGH: Final = 80e-6  # contact area of a pad for the full score (a fifth of the pad), m²
-LEAST: Final = 12e-6  # smallest contact area of each pad, m²
+FULL_CONTACT: Final = 80e-6  # contact area of a pad for the full score (a fifth of the pad), m²
+MIN_CONTACT: Final = 12e-6  # smallest contact area of each pad, m²
 FINGER: Final = 0.025  # thickness of a finger behind its pad, metres
 # Opposite corners of the gripper body's box, tool axes, relative to the pads' ends, metres.
 PALM: Final = np.array([[-0.075, -0.04, -0.16], [0.075, 0.04, -0.055]])
 FLAT: Final = math.cos(FRICTION_ANGLE)
-APART: Final = (0.008, math.radians(20.0))  # metres or radians between distinct grasps of a face
+MIN_DIFFERENCE: Final = (
+    0.008,
+    math.radians(20.0),
+)  # metres or radians between distinct grasps of a face
 BUILT_IN: Final = Path(__file__).parent / "data"
 Points = Float[np.ndarray, "n 3"]
 FIX: Final = "correct the file, or create a new file with `dopepp grasp propose`"
@@ -79,7 +83,7 @@ class Grasp:
     @property
     def opening(self) -> float:
         """Distance between the fingers during the approach: width plus clearance, metres."""
-        return min(self.width + 2 * CLEARANCE, WIDEST)
+        return min(self.width + 2 * CLEARANCE, MAX_OPENING)
 
     def T_obj_tool(self, flipped: bool) -> Transform:  # noqa: N802
         """Return the tool's pose: origin point, z approach, x closing (−closing if flipped)."""
@@ -111,7 +115,7 @@ class _GraspRecord:
     point: tuple[float, float, float]
     closing: tuple[float, float, float]
     approach: tuple[float, float, float]
-    width: Annotated[float, Range(1e-4, WIDEST, "metres")]
+    width: Annotated[float, Range(1e-4, MAX_OPENING, "metres")]
 
 
 @dataclass(frozen=True)
@@ -193,7 +197,7 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
         up = -normals[face]
         bottom = float((body.hull.vertices @ up).min())
         level = [pair for pair in pairs if abs(float(pair[1] @ up)) < STEEPEST_CLOSING]
-        tried = [level[k] for k in rng.permutation(len(level))[:TRIED]]
+        tried = [level[k] for k in rng.permutation(len(level))[:MAX_PAIRS]]
         scored = [
             (score, grasp)
             for middle, closing, width in tried
@@ -204,8 +208,8 @@ def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:
     if not grasps:
         raise UserError(
             f"part {part.name}, on which no grasp was found",
-            f"opposite walls {1000 * THINNEST:g} to {1000 * (WIDEST - CLEARANCE):g} mm apart that "
-            "are reachable from above",
+            f"opposite walls {1000 * MIN_WIDTH:g} to {1000 * (MAX_OPENING - CLEARANCE):g} mm apart "
+            "that are reachable from above",
             "write a file of grasps by hand and pass it with --grasps FILE",
         )
     return tuple(grasps[:count])
@@ -230,7 +234,7 @@ def _pairs(mesh: Mesh, rng: np.random.Generator) -> Iterator[tuple[Vector, Vecto
         # Faces through which the inward ray may leave the solid, i.e. normals along the ray.
         exits = flat @ -normal > FLAT
         for depth in _hits(point, -normal, a[exits], b[exits], c[exits]):
-            if THINNEST <= depth <= WIDEST - CLEARANCE:
+            if MIN_WIDTH <= depth <= MAX_OPENING - CLEARANCE:
                 yield point - depth / 2 * normal, -normal, float(depth)
 
 
@@ -294,16 +298,16 @@ def _score(
     pad = is_beside_pad & (z < 0) & (z > -4 * PAD_HALF[2])
     contacts = (pad & (np.abs(x - side * half) < 5e-4) & (side * facing > FLAT) for side in (1, -1))
     patches = [area * float(np.count_nonzero(contact)) for contact in contacts]
-    if min(patches) < LEAST:
+    if min(patches) < MIN_CONTACT:
         return 0.0
     lever = float(np.linalg.norm(np.cross(centre - grasp.point, grasp.closing))) / diameter
     steep = -float(grasp.approach @ up)
-    return max(0.01, min(min(patches) / ENOUGH, 1.0) - lever - 0.5 * (1 - steep))
+    return max(0.01, min(min(patches) / FULL_CONTACT, 1.0) - lever - 0.5 * (1 - steep))
 
 
 def _select_distinct(scored: list[tuple[float, Grasp]], count: int) -> list[Grasp]:
-    """Return the ``count`` best grasps, without those within :data:`APART` of a better grasp."""
-    distance, cosine = APART[0], math.cos(APART[1])
+    """Return the ``count`` best grasps that differ by at least :data:`MIN_DIFFERENCE`."""
+    distance, cosine = MIN_DIFFERENCE[0], math.cos(MIN_DIFFERENCE[1])
     distinct: list[Grasp] = []
     for _, grasp in sorted(scored, key=lambda pair: -pair[0]):
         if len(distinct) == count:

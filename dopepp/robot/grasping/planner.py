@@ -32,16 +32,16 @@ STEPS: Final = 60  # iterations of inverse kinematics; a reachable pose needs ab
 COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # gripper commands, open to closed
 # Largest estimated height above the bench of a part that lies on it, by layout, metres. In a heap,
 # a part that leans on another part is not much higher.
-LOW: Final = {"single": 0.005, "distractors": 0.005, "heap": 0.002}
-STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
+MAX_HEIGHTS: Final = {"single": 0.005, "distractors": 0.005, "heap": 0.002}
+MAX_APPROACH_ANGLE: Final = np.radians(40.0)  # largest angle between an approach and straight down
 RETREAT: Final = 0.06  # length of the straight descent, metres
 LIFT: Final = 0.12  # height of the lift, metres
 CHECKS: Final = 24  # collision checks per radian of a path
 PENETRATION: Final = 1e-4  # minimum penetration of a collision of the robot, metres
-CARRIED: Final = 1e-3  # minimum penetration of a collision of the carried part, metres
+CARRIED_PENETRATION: Final = 1e-3  # minimum penetration of a collision of the carried part, metres
 LIFT_CHECKS: Final = 25  # collision checks of a lift: every 5 mm
 DISTURBING: Final = 0.3  # factor on the quality of a grasp whose lift moves other objects
-SHALLOW: Final = 0.2  # smallest factor on the quality of a grasp less than 3 mm deep
+SHALLOW_FACTOR: Final = 0.2  # smallest factor on the quality of a grasp less than 3 mm deep
 SHIFT: Final = 0.002  # displacements of the hand for the margin of a grasp, metres
 
 
@@ -211,7 +211,7 @@ class Planner:
                     continue
                 motion = self._motion(poses[0], tool, grasp, start)
                 if motion is not None:
-                    grip = max(SHALLOW, min(depth / INSERTIONS[1], 1.0))
+                    grip = max(SHALLOW_FACTOR, min(depth / INSERTIONS[1], 1.0))
                     return replace(motion, quality=motion.quality * grip)
         return None
 
@@ -233,8 +233,8 @@ class Planner:
         """Yield T_base_tool of the pads' ends and their depth for a grasp and its half turn.
 
         The depth beyond the grasp's point is ``insertion``, or for the largest insertion as much as
-        the bench allows, metres. A pose is omitted if it is tilted by more than :data:`STEEPEST` or
-        touches the bench.
+        the bench allows, metres. A pose is omitted if it is tilted by more than
+        :data:`MAX_APPROACH_ANGLE` or touches the bench.
         """
         up = self.knowledge.T_base_bench[:3, 2]
         signs = np.array(list(product((-1, 1), (-1, 1), [0])))
@@ -243,7 +243,7 @@ class Planner:
         for flipped in (False, True):
             T = T_base_obj @ grasp.T_obj_tool(flipped) @ make_transform(R_tilt, np.zeros(3))
             steep = -float(T[:3, 2] @ up)
-            if steep < np.cos(STEEPEST):
+            if steep < np.cos(MAX_APPROACH_ANGLE):
                 continue
             points = ends @ T[:3, :3].T + T[:3, 3] - self.knowledge.T_base_bench[:3, 3]
             room = (float((points @ up).min()) - ABOVE_BENCH) / steep
@@ -357,4 +357,4 @@ class Planner:
         groups = self._cell.groups[contact.geom]
         is_part = groups == 1
         hits = is_part.any(axis=1) & ~(is_part | (groups == 0)).all(axis=1)
-        return bool((hits & (contact.dist < -CARRIED)).any())
+        return bool((hits & (contact.dist < -CARRIED_PENETRATION)).any())

@@ -29,10 +29,12 @@ from dopepp.robot.grasping.planner import Joints, Plan, Planner
 from dopepp.robot.grasping.rehearsal import SIZE, downward_view
 from dopepp.robot.grasping.unexplained import Unexplained
 
-BESIDE: Final = 0.003  # largest horizontal distance of a point above another point, metres
-ABOVE: Final = 0.002  # smallest height of a point above another point, metres
-SAME: Final = 0.01  # largest distance between two estimates of a part that has not moved, metres
-TRIED: Final = 0.3  # factor on the score of a part for each failed attempt to grasp it
+MAX_OFFSET: Final = 0.003  # largest horizontal distance of a point above another point, metres
+MIN_HEIGHT: Final = 0.002  # smallest height of a point above another point, metres
+MAX_MOTION: Final = (
+    0.01  # largest distance between two estimates of a part that has not moved, metres
+)
+RETRY_FACTOR: Final = 0.3  # factor on the score of a part for each failed attempt to grasp it
 VIEW_TILTS: Final = np.radians([15.0, 25.0, 35.0])  # tilt of the camera on each ring, radians
 NUM_AZIMUTHS: Final = 8  # number of candidates on each ring
 
@@ -59,7 +61,7 @@ def pick_score(probability: float, graspability: float, covered: float, failures
     It depends on the probability of its pose, the quality of its best grasp, the covered share of
     its surface, and the number of failed attempts to grasp it.
     """
-    return probability * graspability * (1 - covered) * TRIED**failures
+    return probability * graspability * (1 - covered) * RETRY_FACTOR**failures
 
 
 def covered_share(target: Transform, others: Sequence[Transform], points: Points) -> float:
@@ -71,10 +73,10 @@ def covered_share(target: Transform, others: Sequence[Transform], points: Points
         return 0.0
     own = transform(target, points)
     other = np.concatenate([transform(pose, points) for pose in others])
-    below = KDTree(own[:, :2]).query_ball_point(other[:, :2], BESIDE)
+    below = KDTree(own[:, :2]).query_ball_point(other[:, :2], MAX_OFFSET)
     is_covered = np.zeros(len(own), bool)
     for height, near in zip(other[:, 2], below, strict=True):
-        is_covered[[index for index in near if own[index, 2] < height - ABOVE]] = True
+        is_covered[[index for index in near if own[index, 2] < height - MIN_HEIGHT]] = True
     return float(is_covered.mean())
 
 
@@ -98,7 +100,7 @@ def choose_part(
     factors = []
     for part, (pose, *others) in zip(parts, orders, strict=True):
         shifts = (np.linalg.norm(other[:3, 3] - pose[:3, 3]) for other in failed)
-        failures = sum(bool(shift < SAME) for shift in shifts)
+        failures = sum(bool(shift < MAX_MOTION) for shift in shifts)
         factors.append((part.probability, covered_share(pose, others, points), failures))
     limits = [pick_score(chance, 1.0, covered, tried) for chance, covered, tried in factors]
     best: Choice | None = None

@@ -22,11 +22,11 @@ from dopepp.inference.refinement.outline import OutlineMesh, filled_mask, posed
 from dopepp.robot.grasping.grasps import PAD_HALF
 
 BESIDE_PX: Final = 8.0  # distance from a detected part's outline within which no pixel counts
-ALIKE: Final = 0.5  # smallest log odds of a pixel in a part's colours
+MIN_LOG_ODDS: Final = 0.5  # smallest log odds of a pixel in a part's colours
 SMOOTH_PX: Final = 5  # side of the square over which log odds are averaged
 THINNEST_PX: Final = 9  # thickness of a region below which it is ignored
 COMMON: Final = 0.3  # share of the image above which the bench has the parts' colours
-ENTERED: Final = 0.1  # largest share of a finger's image inside regions
+MAX_COVERED: Final = 0.1  # largest share of a finger's image inside regions
 TIP: Final = 0.01  # length of the fingers' ends that must be clear, metres
 
 
@@ -50,7 +50,7 @@ class Unexplained:
             corners = transform(self.T_cam_base @ T_base_tool, np.array(list(ends)))
             hull = cv2.convexHull(np.rint(project(corners, self.K)).astype(np.int32))
             finger = cv2.fillConvexPoly(np.zeros_like(self.mask), hull, 1)
-            if (finger & self.mask).sum() > ENTERED * finger.sum():
+            if (finger & self.mask).sum() > MAX_COVERED * finger.sum():
                 return True
         return False
 
@@ -79,7 +79,7 @@ def find_unexplained(
     odds = log_odds(colour_bins(image), covered, BESIDE_PX, float(max(height, width)), tiles=1)
     if odds is None:
         return nothing
-    alike = (cv2.blur(odds, (SMOOTH_PX, SMOOTH_PX)) > ALIKE).astype(np.uint8)
+    alike = (cv2.blur(odds, (SMOOTH_PX, SMOOTH_PX)) > MIN_LOG_ODDS).astype(np.uint8)
     alike[cv2.distanceTransform(1 - covered, cv2.DIST_L2, 3) <= BESIDE_PX] = 0
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THINNEST_PX, THINNEST_PX))
     alike = np.asarray(cv2.morphologyEx(alike, cv2.MORPH_OPEN, disc), np.uint8)

@@ -36,7 +36,7 @@ from dopepp.inference.refinement.region import (
     FOLLOWED,
     FOUND,
     MAX_REPEATS,
-    SURE,
+    MIN_AGREEMENT,
     RegionRefiner,
 )
 from dopepp.inference.refinement.region.round import Round
@@ -542,7 +542,7 @@ def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_as
     refined = refiner.refine(image, K, start, sure, starts=list)
     assert not refined.reason
     assert max(off(refined.T_cam_obj)) < 1.5
-    assert refined.agreement >= SURE
+    assert refined.agreement >= MIN_AGREEMENT
     # Nothing there: the given pose stays, however far one looks.
     nothing = refiner.refine(np.full_like(image, 128), K, start, sure, starts=list)
     assert "alike" in nothing.reason

@@ -8,7 +8,7 @@ from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.part import make_part
 from dopepp.robot.grasping.grasps import (
-    WIDEST,
+    MAX_OPENING,
     Grasp,
     find_grasps,
     propose_grasps,
@@ -43,7 +43,7 @@ def test_the_tool_has_the_axes_of_the_grasp(flipped):
     np.testing.assert_allclose(T[:3, 2], [0, 0, -1])
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
     assert grasp.opening == pytest.approx(0.062)
-    assert Grasp(grasp.point, grasp.closing, grasp.approach, 0.08).opening == WIDEST
+    assert Grasp(grasp.point, grasp.closing, grasp.approach, 0.08).opening == MAX_OPENING
 
 
 def file_of(*grasps, part="pivconnector"):

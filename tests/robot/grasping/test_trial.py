@@ -13,7 +13,7 @@ from dopepp.robot.grasping.cell import HOME, STEP, TRAY
 from dopepp.robot.grasping.execution import SPEED, Execution, _sample_path
 from dopepp.robot.grasping.grasp_trial import GraspTask, PoseSource, SceneObservation, Trials
 from dopepp.robot.grasping.grasps import Grasp
-from dopepp.robot.grasping.planner import DISTURBING, LOW, align_with_bench
+from dopepp.robot.grasping.planner import DISTURBING, MAX_HEIGHTS, align_with_bench
 from dopepp.robot.grasping.selection import EstimatedPart
 
 
@@ -122,7 +122,7 @@ def test_a_pose_close_to_the_bench_is_aligned_with_it(trials, tilt_deg, rise, is
     flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
     tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     estimate = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
-    aligned = align_with_bench(estimate, trials.layout.body.hull, bench, LOW["single"])
+    aligned = align_with_bench(estimate, trials.layout.body.hull, bench, MAX_HEIGHTS["single"])
     if is_aligned:
         np.testing.assert_allclose(aligned[:3, 2], [0, 0, 1], atol=1e-9)
         assert aligned[2, 3] == pytest.approx(0.0235, abs=1e-9)

@@ -35,7 +35,7 @@ from dopepp.inference.refinement.solver import NormalEquations
 INDEPENDENT: Final = 100.0
 """Number of independent measurements of a surface, however many pixels show it."""
 
-ROUGH: Final = 0.25  # standard deviation of a point's plane, spacings
+PLANE_DEVIATION: Final = 0.25  # standard deviation of a point's plane, spacings
 
 Pulls = tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 2"]]
 """Points of the part (camera frame, metres) and their desired motion on the image (pixels)."""
@@ -78,7 +78,7 @@ def plane_terms(
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
     planes = overlay.distance, overlay.nearest, overlay.points, overlay.normals
-    limits = np.ascontiguousarray(origin), reach, view.noise, ROUGH * spacing
+    limits = np.ascontiguousarray(origin), reach, view.noise, PLANE_DEVIATION * spacing
     count = _add_planes(view.depth, view.rays, *planes, *limits, H, g)
     share = min(1.0, INDEPENDENT / max(1.0, count))
     return share * H, share * g

@@ -6,9 +6,9 @@
    (:mod:`~dopepp.inference.refinement.region.shifts`).
 3. A few Gauss–Newton steps follow, in rounds from coarse to fine, with the start pose and its
    covariance as prior. The last round is repeated until it converges.
-4. If less than ``SURE`` of the outline agrees with the image, the descent is repeated from other
-   start poses with a weaker prior, and the result that agrees best is returned. This corrects poses
-   whose covariance is too small, for instance because the part is occluded.
+4. If less than ``MIN_AGREEMENT`` of the outline agrees with the image, the descent is repeated from
+   other start poses with a weaker prior, and the result that agrees best is returned. This corrects
+   poses whose covariance is too small, for instance because the part is occluded.
 5. If the image does not determine the pose, the start pose is kept.
 
 Errors of neighbouring points are correlated, and all points share errors of offset and scale
@@ -57,14 +57,14 @@ WIDENED: Final = 2.0
 """Factor on the prior's deviations in the coarse round. Far from the correct pose, the points of
 the outline contradict each other, so the image has too little weight against the prior."""
 
-SURE: Final = 0.85
+MIN_AGREEMENT: Final = 0.85
 """Agreement below which the search is extended, and smallest agreement of an accepted pose."""
 
 # Support that the extended search requires of a pose, and its smallest gain over the first pose.
-SUPPORTED: Final = 0.35
-MORE: Final = 0.02
+MIN_SUPPORT: Final = 0.35
+MIN_SUPPORT_GAIN: Final = 0.02
 
-FAR: Final = 3.0
+EXTENDED_DEVIATIONS: Final = 3.0
 """Additional standard deviations of the extended search, as multiples of those of a pose without
 covariance."""
 
@@ -78,7 +78,7 @@ REACH: Final = (2.5, 0.15)
 """Search distance in standard deviations of the outline under the prior, and its upper bound as a
 share of the outline's extent."""
 
-ENOUGH: Final = 0.6
+MIN_COVERED: Final = 0.6
 """A round is unnecessary if the next round covers this share of the search distance, which is 1.5
 standard deviations."""
 
@@ -133,7 +133,9 @@ class RegionRefiner:
                 floor = np.diag(np.repeat([1e-5**2, 1e-6**2], 3))
                 prior = Prior(given, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
             # A weaker prior (larger covariance) at the same pose.
-            weak = np.linalg.inv(prior.information) + FAR**2 * np.linalg.inv(broad.information)
+            weak = np.linalg.inv(prior.information) + EXTENDED_DEVIATIONS**2 * np.linalg.inv(
+                broad.information
+            )
             wide_prior = Prior(given, np.linalg.inv(weak))
             rounds = self.rounds(image, K, given, FOLLOWED if followed else FOUND)
             return refinement(*_search(rounds, prior, wide_prior, starts))
@@ -232,7 +234,7 @@ def refinement(end: Solution, agreement: OutlineAgreement) -> Refinement:
 def _search(
     rounds: Sequence[Round], prior: Prior, wide_prior: Prior, starts: Starts | None
 ) -> Outcome:
-    """Descend from the prior's pose and, if this fails or agrees less than ``SURE``, from others.
+    """Descend from the prior's pose; below ``MIN_AGREEMENT``, or without a result, from others too.
 
     Args:
         rounds: Rounds of optimisation, from coarse to fine.
@@ -252,7 +254,7 @@ def _search(
         outcome = _refine(needed, start, prior, search_px)
     except UndecidedError as undecided:
         failure = undecided
-    if starts is not None and (outcome is None or outcome[1].share < SURE):
+    if starts is not None and (outcome is None or outcome[1].share < MIN_AGREEMENT):
         outcome = _search_far(rounds, prior, wide_prior, starts(), outcome) or outcome
     if outcome is None:
         assert failure is not None
@@ -287,9 +289,9 @@ def _search_far(
         if nearby is None:
             last.learn(given, search_px)
         former_agreement = last.agreement(given, search_px) if nearby is None else nearby[1]
-        least_support = max(SUPPORTED, former_agreement.support + MORE)
+        least_support = max(MIN_SUPPORT, former_agreement.support + MIN_SUPPORT_GAIN)
         first.learn(given, search_px)
-        further_starts = [*starts, *wide_prior.draws(1 / FAR, NUM_DRAWS)]
+        further_starts = [*starts, *wide_prior.draws(1 / EXTENDED_DEVIATIONS, NUM_DRAWS)]
         further_starts.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
         coarse_ends = []
         for start in (given, *further_starts[:NUM_STARTS]):
@@ -304,7 +306,7 @@ def _search_far(
                 factor = max(1.0, prior.squared_distance(end) / 6)
                 weakened_prior = Prior(given, prior.information / factor)
                 outcome = _refine([last], end, weakened_prior, search_px)
-                least = SURE if best is None else best[1].share
+                least = MIN_AGREEMENT if best is None else best[1].share
                 if outcome[1].share >= least and outcome[1].support >= least_support:
                     best = outcome
             if best is not None and best[1].share >= CERTAIN:
@@ -327,13 +329,13 @@ def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> 
 
 
 def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
-    """Drop each coarse round whose next round covers the share ``ENOUGH`` of the search distance.
+    """Drop each coarse round if the next covers the share ``MIN_COVERED`` of the search distance.
 
     Args:
         rounds: Rounds of optimisation, from coarse to fine.
         reach: Search distance, pixels of the image.
     """
-    while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
+    while len(rounds) > 1 and rounds[1].farthest(reach) >= MIN_COVERED * reach:
         rounds = rounds[1:]
     if len(rounds) == 1 and rounds[0].farthest(reach) < reach:
         # Run the last round twice: the second pass learns the colours at a better pose.

@@ -50,7 +50,7 @@ MIN_POINTS: Final = 24  # smallest number of outline points that determine a pos
 MIN_GAIN: Final = 2.0
 """Smallest increase of the information's log determinant; below it, the image is uninformative."""
 
-FIRM: Final = (math.radians(1.0), 5e-3)
+PRECISE: Final = (math.radians(1.0), 5e-3)
 """Standard deviations of a precise pose: radians, and metres per metre of distance."""
 
 MIN_AGREEING: Final = 0.3  # smallest agreement of a refined outline that is accepted
@@ -255,7 +255,7 @@ class Round:
         """
         added, before = end.information - information, prior.information
         if self._is_followed:
-            rotation, shift = FIRM
+            rotation, shift = PRECISE
             firm = np.repeat([rotation, shift * float(end.T_cam_obj[2, 3])], 3) ** 2
             before = np.linalg.inv(np.linalg.inv(before) + np.diag(firm))
         return float(np.linalg.slogdet(before + added)[1] - np.linalg.slogdet(before)[1])
