@@ -92,7 +92,7 @@ def render(
             renderer=renderer,
             layout=layout,
             camera=camera,
-            working_distance=working_distance,
+            working_distance=options.distance_range(working_distance),
             views=views,
         )
         if preview:

@@ -97,22 +97,26 @@ def load_estimator(
         raise UserError(problem, f"{option} with a {other}", f"leave out {option}")
     if not is_mesh:
         return PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
-    distances = None
-    if working_distance is not None:
-        allowed = "NEAR,FAR in metres"
-        distances = two_numbers("--working-distance", working_distance, allowed, "0.3,0.5")
-    tilt_deg = 180.0 if tilt is None else tilt
+    distances, tilt_deg = distance_range(working_distance), 180.0 if tilt is None else tilt
     return PoseEstimator.from_mesh(
         model, unit, distances, tilt_deg, max_ms=max_ms, scale_error=scale_error
     )
 
 
+def distance_range(text: str | None) -> tuple[float, float] | None:
+    """Parse the value of ``--working-distance``, if any."""
+    allowed = "NEAR,FAR in metres"
+    return None if text is None else two_numbers("--working-distance", text, allowed, "0.3,0.5")
+
+
 def two_numbers(option: str, text: str, allowed: str, example: str) -> tuple[float, float]:
     """Parse the value of an option that consists of two numbers with a comma between them."""
     try:
-        first, second = map(float, text.split(","))
+        first, second = map(float, text.strip("[]").split(","))
     except ValueError:
-        raise UserError(f"{option} {text}", allowed, f"write e.g. {option} {example}") from None
+        raise UserError(
+            f"{option} {text:.100}", allowed, f"write e.g. {option} {example}"
+        ) from None
     return first, second
 
 

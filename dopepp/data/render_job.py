@@ -24,7 +24,7 @@ import yaml
 from dopepp.core.errors import NO_SPACE, StoppedError, UserError, check_choice, system_failure
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_file
 from dopepp.core.json import read_json
-from dopepp.core.validation import Range, check
+from dopepp.core.validation import Pair, Range, check
 from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.formats.bop.bop_writer import BopWriter
 from dopepp.data.formats.ndds.ndds_writer import NddsWriter
@@ -93,7 +93,7 @@ def make_job(
     renderer: str = "raster",
     layout: str = "bop",
     camera: str | Path | None = None,
-    working_distance: str | None = None,
+    working_distance: Pair | None = None,
     views: int = 1,
 ) -> RenderJob:
     """Make a job from user input; the arguments are the options of ``dopepp render``.
@@ -110,7 +110,7 @@ def make_job(
         renderer: Name of a renderer, see :mod:`dopepp.virtual.renderers`.
         layout: Key of :data:`WRITERS`.
         camera: File of the camera to simulate; None for the preset's camera.
-        working_distance: ``NEAREST,FARTHEST`` distance of the parts from this camera, metres.
+        working_distance: Nearest and farthest distance of the parts from this camera, metres.
         views: Number of cameras of each scene. More than 1 gives a folder per scene; BOP only.
     """
     check_choice("--format", layout, WRITERS)
@@ -163,20 +163,14 @@ def named_part(text: str, unit: str | None) -> Part:
 
 
 def _in_camera(
-    scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
+    scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: Pair | None
 ) -> Preset:
     """Return the preset with a file's camera and distance (metres); log the parts' image sizes."""
     if path is None or distance is None:
         missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
         given = "--working-distance" if path is None else "--camera"
         raise UserError(f"{given} without {missing}", "both options, or neither", f"add {missing}")
-    try:
-        nearest, farthest = (float(end) for end in distance.strip("[]").split(","))
-    except ValueError as error:
-        allowed = "NEAREST,FARTHEST in metres, e.g. 0.3,0.8"
-        fix = "pass e.g. --working-distance 0.3,0.8"
-        raise UserError(f"--working-distance {distance:.100}", allowed, fix) from error
-    view = View(*read_lens(path), (nearest, farthest), str(path))
+    view = View(*read_lens(path), distance, str(path))
     view.check(parts)
     for line in view.in_words(parts):
         _log.info("%s", line)

@@ -380,9 +380,11 @@ def choose(
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
     defaults = np.array(RecoveryOptions().refined_weights) if refined else None
-    if refined and (not correct.any() or correct.all()):
-        weights = np.array(RecoveryOptions().refined_weights)
-    elif not correct.any() or correct.all():
+    if correct.any() and not correct.all():
+        weights = fit_weights(features, correct, defaults)
+    elif defaults is not None:
+        weights = defaults
+    else:
         kind = "correct" if correct.any() else "incorrect"
         raise UserError(
             f"{len(correct)} validation detections, all of them {kind}"
@@ -391,8 +393,6 @@ def choose(
             "correct and incorrect detections to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
-    else:
-        weights = fit_weights(features, correct, defaults)
     best = empty.best_scores(score(empty.features, weights))[~empty.shows_lookalikes()]
     best = np.sort(best)[::-1]
     allowed = int(false_positive_rate * len(best))

@@ -276,13 +276,9 @@ def displace(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
 
 
 def draw_view(
-    board: Board,
-    T_cam_board: Transform,
-    camera: Camera,
-    rng: np.random.Generator,
-    noise: float = 4.0,
+    board: Board, T_cam_board: Transform, camera: Camera, rng: np.random.Generator
 ) -> RGBImage:
-    """Render a board with lens distortion, blur and Gaussian noise (grey levels, 0 to 255)."""
+    """Render a board with lens distortion, blur and Gaussian noise of 4 grey levels."""
     assert camera.size is not None
     width, height = camera.size
     steps = (np.arange(OVERSAMPLING) + 0.5) / OVERSAMPLING - 0.5
@@ -301,5 +297,5 @@ def draw_view(
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": BACKGROUND}
     drawn = cv2.remap(page, on_page[..., 0], on_page[..., 1], cv2.INTER_LINEAR, **border)
     grey = drawn.reshape(height, OVERSAMPLING, width, OVERSAMPLING).mean(axis=(1, 3))
-    grey = 20 + 0.8 * grey + rng.normal(0, noise, grey.shape)
+    grey = 20 + 0.8 * grey + rng.normal(0, 4.0, grey.shape)
     return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dopepp.core.errors import UserError, require
-from dopepp.core.files import cache_folder
+from dopepp.core.files import cache_folder, write_file
 from dopepp.core.pool import available_cores
 
 _log = logging.getLogger(__name__)
@@ -164,8 +164,7 @@ def is_usable(library: Path) -> bool:
     usable = trial.returncode == 0 and "mean" in trial.stdout
     _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
     try:
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        cached.write_text("works" if usable else "fails", "utf-8")
+        write_file(cached, b"works" if usable else b"fails")
     except OSError as error:
         message = "%s cannot be written, so the next process tests libLLVM again: %s"
         _log.warning(message, cached, error)
