@@ -29,9 +29,8 @@ from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.mesh import Mesh
 from dopepp.parts.mesh.read import ycb_part
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers.raster import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject

@@ -28,13 +28,12 @@ from dopepp.geometry.camera import Transform, make_transform, move_pose
 from dopepp.geometry.rotation import random_rotation
 from dopepp.inference.refinement import verification
 from dopepp.inference.refinement.outline import make_outline_mesh
-from dopepp.inference.refinement.refiner import DEVIATION_FACTOR
+from dopepp.inference.refinement.refiner import INFLATION
 from dopepp.inference.refinement.region import RegionRefiner
 from dopepp.inference.refinement.solver import Prior
 from dopepp.inference.refinement.verification import EVIDENCE, VerificationModel, Verifier
 from dopepp.metrics.functional import add, add_s
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import Preset, preset_of
@@ -266,9 +265,7 @@ def samples(number: int, num_scenes: int, seed: int, photos: str | None) -> Iter
         T = scene.objects[scene.targets[0]].T_cam_obj
         empty = np.full_like(image, rng.integers(0, 256, 3))
         for start, covariance in starts(rng, T, part, scene.K):
-            refined = refiner.refine(
-                image, scene.K, start, DEVIATION_FACTOR**2 * covariance, starts=list
-            )
+            refined = refiner.refine(image, scene.K, start, INFLATION**2 * covariance, starts=list)
             given = Prior(start, np.linalg.inv(covariance))
             stated = covariance if refined.covariance is None else refined.covariance
             sure = rng.uniform(0.05, 1.0) * covariance

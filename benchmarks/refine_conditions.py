@@ -27,8 +27,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.metrics.pose import assign
 from dopepp.parts.catalogue import load_part
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 from dopepp.virtual import PRESETS, Factory, Scene, render
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.scene import Grooves, Material

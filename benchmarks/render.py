@@ -28,8 +28,7 @@ from manifold3d import Manifold
 from manifold3d import Mesh as ManifoldMesh
 
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual import PRESETS, Factory, make_surface, render
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.sensor import capture

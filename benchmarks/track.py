@@ -36,8 +36,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.several_views.views_tracker import ViewsTracker
 from dopepp.inference.tracker import PoseTracker
 from dopepp.parts.catalogue import load_part
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 from dopepp.virtual import PRESETS, Factory, Scene, SceneObject, make_surface, render
 from dopepp.virtual.scene import Light, Material
 from dopepp.virtual.sensor import capture

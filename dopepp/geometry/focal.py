@@ -18,7 +18,7 @@ from dopepp.geometry.camera import CameraMatrix, Transform, move_pose, project_k
 from dopepp.geometry.cuboid import Cuboid
 
 MIN_POINTS: Final = 8  # With fewer keypoints, an outlier resembles perspective
-LINEAR_FROM: Final = 0.02
+SOFT: Final = 0.02
 """Keypoint error, as a share of the part's extent in the image, above which the loss is linear."""
 
 LENGTHS: Final = (0.5, 1.0, 2.0)  # Initial factors; each search covers half to twice the factor
@@ -63,13 +63,7 @@ def focal_factor(
         most = np.array([*6 * [math.inf], math.log(2)])[:unknowns]
         start, bounds = np.zeros(unknowns), (-most, most)
         return least_squares(
-            errors,
-            start,
-            loss="soft_l1",
-            f_scale=LINEAR_FROM,
-            bounds=bounds,
-            max_nfev=50,
-            args=(first,),
+            errors, start, loss="soft_l1", f_scale=SOFT, bounds=bounds, max_nfev=50, args=(first,)
         )
 
     free = {first: fit(7, first) for first in LENGTHS}

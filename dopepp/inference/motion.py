@@ -21,9 +21,7 @@ from dopepp.geometry.camera import Step, Transform, move_pose, step_between
 # moves by up to 8° and 5 % of the distance per frame (two standard deviations).
 STILL: Final = (math.radians(0.05), 2e-4)
 SUDDEN: Final = (math.radians(4.0), 0.025)
-MANOEUVRE: Final = (
-    0.6  # further standard deviation of this change, share of speed + last correction
-)
+SWERVE: Final = 0.6  # further standard deviation of this change, share of speed + last correction
 PERSISTENCE: Final = 0.95  # share of the velocity that remains after a frame
 
 
@@ -71,9 +69,7 @@ class Motion:
         for number, unit in enumerate((1.0, distance)):
             axes = slice(3 * number, 3 * number + 3)
             speeds = np.linalg.norm(self.velocity[axes]), np.linalg.norm(self.correction[axes])
-            deviations.append(
-                max(least[number] * unit, MANOEUVRE / math.sqrt(3) * float(sum(speeds)))
-            )
+            deviations.append(max(least[number] * unit, SWERVE / math.sqrt(3) * float(sum(speeds))))
         return np.repeat(deviations, 3)
 
 

@@ -33,15 +33,9 @@ from dopepp.recovery.detection import Detection
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
 
-SEARCH_MARGIN: Final = (
-    0.5  # margin around a doubtful part in which it is searched, share of its extent
-)
-MAX_MATCH_DISTANCE: Final = (
-    0.5  # largest distance between the centres of a track and its detection, diameters
-)
-MAX_DIFFERENCE: Final = (
-    0.1  # mean keypoint distance above which track and detection disagree, diameters
-)
+MARGIN: Final = 0.5  # margin around a doubtful part in which it is searched, share of its extent
+MAX_SHIFT: Final = 0.5  # distance between the centres of a track and its detection, diameters
+MAX_ERROR: Final = 0.1  # mean keypoint distance above which track and detection disagree, diameters
 MAX_DISAGREEMENTS: Final = 2  # consecutive disagreeing detections after which a track moves to them
 # Share of the usual agreement below which a track is doubtful. On rendered sequences, the share was
 # 0.97 at correct poses, and 0.5 at poses that an occluder had displaced.
@@ -213,7 +207,7 @@ class Tracker(ABC, Generic[Item]):
                 continue
             if state.unseen or (state.doubts and detected.agreement > tracked.agreement):
                 state.move_to(detected, motion)
-            elif self._keypoint_distance(tracked, detected) <= MAX_DIFFERENCE:
+            elif self._keypoint_distance(tracked, detected) <= MAX_ERROR:
                 state.disagreements = 0
             elif detected.agreement >= tracked.agreement:
                 state.disagreements += 1
@@ -228,10 +222,7 @@ class Tracker(ABC, Generic[Item]):
         for name in self._cuboid_of:
             left = [detection for detection in detections if detection.object == name]
             states = [state for state in self._states if state.estimate.object == name]
-            for is_astray, limit in (
-                (False, MAX_MATCH_DISTANCE * self._diameters[name]),
-                (True, math.inf),
-            ):
+            for is_astray, limit in ((False, MAX_SHIFT * self._diameters[name]), (True, math.inf)):
                 chosen = [s for s in states if bool(s.unseen or s.doubts) == is_astray]
                 tracked = np.reshape([s.estimate.pose[:3, 3] for s in chosen], (-1, 1, 3))
                 detected = np.reshape([item.pose[:3, 3] for item in left], (1, -1, 3))
@@ -311,9 +302,7 @@ def _estimate(detection: Detection) -> Estimate[Detection]:
 def region_around(detections: Sequence[Detection], image: RGBImage) -> Region | None:
     """Return a region with a margin around detections; None if it is almost outside the image."""
     points = np.concatenate([detection.keypoints for detection in detections])
-    margin = SEARCH_MARGIN * max(
-        np.ptp(detection.keypoints, axis=0).max() for detection in detections
-    )
+    margin = MARGIN * max(np.ptp(detection.keypoints, axis=0).max() for detection in detections)
     limits = np.array(image.shape[1::-1])
     start = np.clip(np.floor(points.min(axis=0) - margin), 0, limits)
     end = np.clip(np.ceil(points.max(axis=0) + margin), 0, limits)

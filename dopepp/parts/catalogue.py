@@ -22,9 +22,9 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 
 from dopepp.core.errors import UserError
-from dopepp.parts.mesh import Mesh, weld
+from dopepp.parts.mesh import weld
 from dopepp.parts.mesh.read import READERS, read_in_unit
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.parts.size import is_plausible, part_in_words
 
 _log = logging.getLogger(__name__)

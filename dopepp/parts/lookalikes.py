@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.parts.mesh import Faces, Mesh, SurfaceTree, Vertices, half_sphere
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.mesh import Faces, SurfaceTree, Vertices, half_sphere
+from dopepp.parts.part import Mesh, Part, make_part
 
 STRETCH: Final = 1.3  # factor on the longest side of the stretched copy
 _CUT_SHARE: Final = 0.25  # Share of the surface that the cut removes

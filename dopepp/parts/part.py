@@ -18,13 +18,16 @@ from pydantic import Field
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, parse
+from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import is_rigid
 from dopepp.geometry.symmetry import ContinuousSymmetry
 from dopepp.parts.mesh import (
-    Mesh,
+    Colours,
+    Faces,
     Points,
     SurfaceTree,
+    Vertices,
     hash_triangles,
     largest_distance,
     sample_surface,
@@ -47,6 +50,34 @@ MAX_LIGHT_FACES: Final = 4000
 
 _SAME_SHAPE: Final = 0.001  # Largest distance between equal surfaces, diameters
 _FARTHEST: Final = 1e6  # Largest coordinate, metres; its square is finite
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the object frame.
+
+    Attributes:
+        vertices: Positions in metres, float64.
+        faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
+        uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
+        texture: RGB texture image, first row on top.
+        colours: sRGB of each vertex, 0 – 255; None with a texture.
+        normals: Normal of each vertex as in the file, of any length; may be zero or not finite.
+    """
+
+    vertices: Vertices
+    faces: Faces
+    uv: Float[np.ndarray, "vertices 2"] | None = None
+    texture: RGBImage | None = None
+    colours: Colours | None = None
+    normals: Float[np.ndarray, "vertices 3"] | None = None
+
+
+@dataclass(frozen=True)
+class RawMesh(Mesh):
+    """Triangles as read from a file, in its unit, before any check."""
+
+    unit: str | None = None  # as stated by the file; None: not stated
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,10 @@ from dopepp.geometry.rotation import (
     rotation_vector_to_matrix,
 )
 from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group, rotations_about
-from dopepp.parts.mesh import Mesh, Points, SurfaceTree, half_sphere, largest_distance
+from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
+from dopepp.parts.part import Mesh
 
-_MAX_MEAN_DISTANCE: Final = (
-    0.06  # Mean distance that excludes a symmetry within 2.6° of the axis, diameters
-)
+_MAX_MEAN: Final = 0.06  # mean distance that excludes a symmetry within 2.6° of the axis, diameters
 _HUBER_WIDTH: Final = 0.02
 """Distance above which the loss of a point is linear (Huber), diameters: a feature may lack a
 counterpart."""
@@ -183,7 +182,7 @@ class Candidates:
         index = np.flatnonzero(possible)
         moved = self._rough_probes @ np.swapaxes(R[index], 1, 2)
         rough = self._surface.distances(moved, neighbours=1).mean(axis=1)
-        index, rough = index[rough < _MAX_MEAN_DISTANCE], rough[rough < _MAX_MEAN_DISTANCE]
+        index, rough = index[rough < _MAX_MEAN], rough[rough < _MAX_MEAN]
         taken: list[Vector] = []
         for number in index[np.argsort(rough, kind="stable")]:
             axis = self._axes[number]

@@ -15,9 +15,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from dopepp.core.validation import Range, check
 
-TRAINED_KEY: Final = (
-    "trained_state"  # Key of the weights to train further; state_dict has the average
-)
+TRAINED: Final = "trained_state"  # Key of the weights to train further; state_dict has the average
 _AVERAGED: Final = "averaged_state"  # Key of the average in a loaded checkpoint
 
 _RAMP: Final = 10
@@ -108,7 +106,7 @@ class AveragedWeights(WeightAveraging):
 
     After step n, ``average += (1 − d)·(weights − average)`` with ``d = min(decay, n / (n + 9))``.
     The ``state_dict`` of a checkpoint is the average; training continues with the weights under
-    :data:`TRAINED_KEY`.
+    :data:`TRAINED`.
 
     Lightning's ``EMAWeightAveraging`` is not sufficient. Its checkpoints of a validation swap both
     sets of weights. Its training ends with the average and cannot be resumed exactly. It averages
@@ -172,10 +170,10 @@ class AveragedWeights(WeightAveraging):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Store the average as ``state_dict`` and the trained weights under :data:`TRAINED_KEY`."""
+        """Store the average as ``state_dict`` and the trained weights under :data:`TRAINED`."""
         trained = self._set_aside or checkpoint["state_dict"]
         averaged = self._averaged.module.state_dict()
-        checkpoint[TRAINED_KEY] = trained
+        checkpoint[TRAINED] = trained
         checkpoint["state_dict"] = {
             name: averaged[name].to(value.dtype) for name, value in trained.items()
         }
@@ -189,6 +187,6 @@ class AveragedWeights(WeightAveraging):
 
 def restore_trained_weights(checkpoint: dict[str, Any]) -> None:
     """Replace averaged weights in a checkpoint's ``state_dict`` by the weights being trained."""
-    if TRAINED_KEY in checkpoint:
+    if TRAINED in checkpoint:
         checkpoint[_AVERAGED] = checkpoint["state_dict"]
-        checkpoint["state_dict"] = checkpoint.pop(TRAINED_KEY)
+        checkpoint["state_dict"] = checkpoint.pop(TRAINED)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
 
 _WAIT_S: Final = 60  # Timeout of locks on an SQLite file
-MAX_COUNT: Final = 10**6  # Maximum number of trials or epochs
+MOST: Final = 10**6  # Maximum number of trials or epochs
 
 
 class PrunedError(Exception):
@@ -50,12 +50,8 @@ class TrialReport(Callback):
     ) -> None:
         self.monitor, self.number, self.prune, self.pruned = monitor, number, prune, ""
         self._location, self._name = storage, study
-        self._after_trials = check(
-            "search.prune_after_trials", after_trials, int, Range(1, MAX_COUNT)
-        )
-        self._after_epochs = check(
-            "search.prune_after_epochs", after_epochs, int, Range(0, MAX_COUNT)
-        )
+        self._after_trials = check("search.prune_after_trials", after_trials, int, Range(1, MOST))
+        self._after_epochs = check("search.prune_after_epochs", after_epochs, int, Range(0, MOST))
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Load the study and find the trial's id in its database."""

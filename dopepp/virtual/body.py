@@ -22,8 +22,8 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import Checked, Pair, Share, Span
 from dopepp.geometry.rotation import Vector
 from dopepp.parts.convex import Piece, convex_pieces, hull_faces
-from dopepp.parts.mesh import Mesh, Vertices
-from dopepp.parts.part import Part
+from dopepp.parts.mesh import Vertices
+from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
 

@@ -44,8 +44,7 @@ from dopepp.inference.templates.views import (
     view_rotations,
 )
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import preset_of
 

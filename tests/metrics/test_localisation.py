@@ -13,8 +13,7 @@ from dopepp.geometry.camera import make_transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.functional import VSD_DELTA, vsd
 from dopepp.metrics.localisation import Localisation, num_matched
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 
 K = np.array([[100.0, 0, 31.5], [0, 110.0, 23.5], [0, 0, 1]])
 SIZE = (64, 48)

@@ -20,8 +20,7 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.functional import add, add_s, auc, mspd, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow, shown_columns
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 
 K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -20,8 +20,7 @@ from dopepp.models.checkpoint import (
 )
 from dopepp.models.network import build_network
 from dopepp.models.storage import write_atomic
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import make_part
+from dopepp.parts.part import Mesh, make_part
 from dopepp.parts.size import LearnedRange
 from tests.models.conftest import assert_weights
 

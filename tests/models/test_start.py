@@ -8,8 +8,7 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.models.start import start_from_checkpoint, start_from_parts
 from dopepp.models.storage import read_safetensors, write_atomic
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import make_part
+from dopepp.parts.part import Mesh, make_part
 from tests.models.conftest import assert_weights, weights_of
 
 OUTPUTS = {f"head.{k}_branches.0.1.{t}" for k in ("belief", "field") for t in ("weight", "bias")}

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Mesh
 
 
 def mesh_of(*solids, scale=1.0):

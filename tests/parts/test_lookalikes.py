@@ -7,9 +7,9 @@ import trimesh
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.lookalikes import STRETCH, lookalikes, mirror_distance
-from dopepp.parts.mesh import Mesh, weld
+from dopepp.parts.mesh import weld
 from dopepp.parts.mesh.read import find_topology
-from dopepp.parts.part import make_part
+from dopepp.parts.part import Mesh, make_part
 from tests.parts.makers import mesh_of, solid_of
 
 

@@ -11,8 +11,7 @@ from scipy.spatial import KDTree
 
 from dopepp.core.errors import UserError
 from dopepp.parts import Part, make_part, servoholder
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import MAX_LIGHT_FACES, MAX_POINTS
+from dopepp.parts.part import MAX_LIGHT_FACES, MAX_POINTS, Mesh
 
 
 def symmetric_part():

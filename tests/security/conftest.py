@@ -17,8 +17,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.models.storage import write_atomic
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import make_part
+from dopepp.parts.part import Mesh, make_part
 
 MOST_MB = 400
 """Memory that reading a small hostile file may take, mostly for first imports of libraries."""

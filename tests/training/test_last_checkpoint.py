@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.training.last_checkpoint import LastCheckpoint
-from dopepp.training.optimizers import TRAINED_KEY, AveragedWeights
+from dopepp.training.optimizers import TRAINED, AveragedWeights
 from dopepp.training.pose_validation import EarlyStop
 from dopepp.training.run_checkpoints import newest_checkpoint
 from dopepp.training.system import PoseSystem
@@ -182,7 +182,7 @@ def averaged(runs, tmp_path_factory):
 
 
 def test_a_checkpoint_has_both_trained_weights_and_average(averaged, whole):
-    average, trained = (saved(averaged[0])[name] for name in ("state_dict", TRAINED_KEY))
+    average, trained = (saved(averaged[0])[name] for name in ("state_dict", TRAINED))
     assert_same(trained, averaged[1].state_dict())  # training continued with these weights
     assert_same(trained, whole[1].state_dict())  # as without an average
     assert any(not torch.equal(average[name], trained[name]) for name in trained)

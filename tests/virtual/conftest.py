@@ -8,8 +8,7 @@ import trimesh
 
 from dopepp.geometry.camera import camera_matrix
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import make_part
+from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import Factory, Scene, make_surface
 from dopepp.virtual.scene import Ambient, Light
 from tests.parts.makers import mesh_of

@@ -11,8 +11,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import make_part
+from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import PRESETS, Factory, render
 from dopepp.virtual.body import Distractors
 from dopepp.virtual.sensor import Sensors, capture

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import random_rotation
-from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface, render
 from dopepp.virtual.renderers.raster import silhouette, visible_fractions
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Plane, Scene, SceneObject

@@ -44,7 +44,7 @@ from dopepp.experiment.results.folder import (
     PRUNED_FILE,
     read_json,
 )
-from dopepp.training.pruning import MAX_COUNT, open_storage
+from dopepp.training.pruning import MOST, open_storage
 
 _FACTS: Final = "configuration"
 _NUM_SHOWN: Final = 3
@@ -81,7 +81,7 @@ def search(
             "leave out search=optuna, or choose another experiment",
         )
     options: Any = OmegaConf.to_container(config.search, resolve=True)
-    wanted = check("search.num_trials", options["num_trials"], int, Range(1, MAX_COUNT))
+    wanted = check("search.num_trials", options["num_trials"], int, Range(1, MOST))
     at_a_time = check("search.num_parallel", options["num_parallel"], int, Range(1, _MAX_PARALLEL))
     space = read_space(loader, options["space"], arguments)
     for example in examples(space):

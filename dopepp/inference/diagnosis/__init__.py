@@ -33,9 +33,7 @@ from dopepp.parts.size import is_plausible, size_in_words
 
 __all__ = ["CHECKS", "Case", "Diagnosis", "diagnose"]
 
-MAX_SIZE_RATIO: Final = (
-    1.05  # ratio of two sizes of a part that simplification of its mesh may cause
-)
+MAX_RATIO: Final = 1.05  # ratio of two sizes of a part that simplification of its mesh may cause
 # Grey level (0 to 255) of highlights below which an image is dark: above 105 in good renders, 35 to
 # 60 at 1/16 of the light.
 MIN_HIGHLIGHT: Final = 70.0
@@ -58,9 +56,7 @@ FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 # parts, mostly below 0.2 on images without the part.
 MIN_BELIEF: Final = 0.3
 MIN_SCORE: Final = 0.03  # of a correct detection; untuned networks' false positives score lower
-MAX_ERROR_SHARE: Final = (
-    0.08  # largest reprojection error, share of the part's length: up to 0.06 if good
-)
+MAX_ERROR: Final = 0.08  # reprojection error, share of the part's length: up to 0.06 if good
 MIN_AGREEMENT: Final = 0.6  # smallest share of the outline that agrees: 0.68 to 1 in good renders
 
 ABSENT: Final = (
@@ -94,7 +90,7 @@ def part_size(case: Case) -> Diagnosis:
         if given.mesh is not None:
             extents = np.ptp(given.mesh.vertices, axis=0)
             ratio = float(np.linalg.norm(extents) / np.linalg.norm(learned))
-            if not _near(ratio, MAX_SIZE_RATIO):
+            if not _near(ratio, MAX_RATIO):
                 mesh = f"its mesh {size_in_words(extents)}, {ratio:.3g} times that"
                 return Diagnosis("part", f"{sizes[-1]}, and {mesh}", _unit_fix(ratio))
         if not is_plausible(part):
@@ -232,7 +228,7 @@ def pose(case: Case) -> Diagnosis:
     sentence = f"{name} has a reprojection error of {detection.reprojection_error_px:.1f} pixels"
     if not case.estimator.has_network:
         sentence = f"{name} is {case.length_px:.0f} pixels long"
-    if share > MAX_ERROR_SHARE:
+    if share > MAX_ERROR:
         fix = "check K and the mesh; if both are correct, train longer or with more such images"
         return Diagnosis("pose", f"{sentence}, {share:.0%} of its length", fix)
     if refined is None:
@@ -283,6 +279,6 @@ def _unit_fix(ratio: float) -> str:
     """Return the remedy for a mesh that is too large by a ratio, e.g. the ratio of two units."""
     for read, metres in UNITS.items():
         for actual, actual_metres in UNITS.items():
-            if read != actual and _near(ratio * actual_metres / metres, MAX_SIZE_RATIO):
+            if read != actual and _near(ratio * actual_metres / metres, MAX_RATIO):
                 return f"it was read in {read} and is in {actual}: --unit {actual}"
     return "pass the mesh of the trained part: --part"

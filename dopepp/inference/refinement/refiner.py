@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
 TERMS: Final = ("region", "depth")
 
-DEVIATION_FACTOR: Final = 3.0
+INFLATION: Final = 3.0
 """Factor on the standard deviations of a network's pose. Its covariance was fitted to images like
 the training images; errors are larger on other images."""
 
@@ -134,7 +134,7 @@ class Refiner:
         if not is_tracked and np.isfinite(detection.peaks).any():  # templates have no peaks
             # A tracker predicts how far a part moves, but a network's covariance may be too small.
             starts = partial(poses_of_four, cuboid, detection.peaks, K)
-            prior = DEVIATION_FACTOR**2 * covariance
+            prior = INFLATION**2 * covariance
         refined = refiner.refine(image, K, T_cam_obj, prior, depth, is_tracked, starts)
         detection = replace(detection, start=(T_cam_obj, prior))
         if refined.covariance is None:

@@ -22,7 +22,7 @@ from dopepp.inference.refinement.joint_refinement import (
     PosedImage,
     rotate_covariance,
 )
-from dopepp.inference.refinement.refiner import DEVIATION_FACTOR, Refiner
+from dopepp.inference.refinement.refiner import INFLATION, Refiner
 from dopepp.inference.refinement.region.round import OutlineAgreement
 from dopepp.inference.refinement.solver import PoseMatrix, Prior, UndecidedError
 from dopepp.inference.several_views.observations import PartGeometry, PartObservation, separation
@@ -142,7 +142,7 @@ class JointEstimator:
         while len(selected) > 1 and (selected, len(observations)) not in tried:
             tried.append((selected, len(observations)))
             start = geometry.mean([observation.pose for observation in observations])
-            search_range = Prior(start.T_cam_obj, start.information / DEVIATION_FACTOR**2)
+            search_range = Prior(start.T_cam_obj, start.information / INFLATION**2)
             views_with_observation = {observation.view for observation in observations}
             numbers = sorted(selected)
             starts = [item.start for item in observations if item.view in selected]

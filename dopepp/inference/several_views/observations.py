@@ -19,12 +19,12 @@ from dopepp.geometry.camera import Transform, move_pose, transform
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.joint_refinement import PosedImage
-from dopepp.inference.refinement.refiner import DEVIATION_FACTOR
+from dopepp.inference.refinement.refiner import INFLATION
 from dopepp.inference.refinement.solver import PoseMatrix, Prior
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
-GATE: Final = 4.5 * DEVIATION_FACTOR
+GATE: Final = 4.5 * INFLATION
 """Largest Mahalanobis distance between detections of one part. The limit is generous: covariances
 were fitted to images like the training images, and the joint pose is verified."""
 

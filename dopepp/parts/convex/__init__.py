@@ -17,8 +17,7 @@ from scipy.spatial import ConvexHull
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import cache_folder, write_file
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 
 Piece = Float[np.ndarray, "vertices 3"]
 

@@ -1,4 +1,4 @@
-"""Meshes, and measures of triangles: areas, samples, diameters, a hash, distances to a surface.
+"""Measures of triangles: areas, samples, the largest distance, a hash, and distances to a surface.
 
 The functions take arrays, so that triangles can be measured before they are checked. The modules of
 this package read mesh files.
@@ -7,15 +7,12 @@ this package read mesh files.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import scipy  # SciPy loads its submodules on first use
 from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
-
-from dopepp.drawing.pictures import RGBImage
 
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
@@ -35,34 +32,6 @@ NUM_COVERING: Final = 60_000
 _NUM_NEIGHBOURS: Final = 6
 """Surface points whose triangles are compared: near an edge, the nearest point's triangle may not
 be the nearest triangle."""
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles in the object frame.
-
-    Attributes:
-        vertices: Positions in metres, float64.
-        faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
-        uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
-        texture: RGB texture image, first row on top.
-        colours: sRGB of each vertex, 0 – 255; None with a texture.
-        normals: Normal of each vertex as in the file, of any length; may be zero or not finite.
-    """
-
-    vertices: Vertices
-    faces: Faces
-    uv: Float[np.ndarray, "vertices 2"] | None = None
-    texture: RGBImage | None = None
-    colours: Colours | None = None
-    normals: Float[np.ndarray, "vertices 3"] | None = None
-
-
-@dataclass(frozen=True)
-class RawMesh(Mesh):
-    """Triangles as read from a file, in its unit, before any check."""
-
-    unit: str | None = None  # as stated by the file; None: not stated
 
 
 def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:

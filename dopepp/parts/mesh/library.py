@@ -26,7 +26,8 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import whole_image
 from dopepp.geometry.camera import Transform
-from dopepp.parts.mesh import RawMesh, Vertices, weld
+from dopepp.parts.mesh import Vertices, weld
+from dopepp.parts.part import RawMesh
 
 MAX_UNPACKED_BYTES: Final = 50_000_000
 """Largest text in a 3MF file: trimesh uses 17 times as much memory."""
@@ -62,7 +63,7 @@ def read_stl(path: Path) -> RawMesh:
     if is_text and b"\0" in data:  # never in text
         stated = f"{num_triangles} triangles, {promised} bytes"
         raise ValueError(f"{len(data)} bytes, but the header states {stated}")
-    mesh = read_scene(data, "stl")[0]
+    mesh, _ = read_scene(data, "stl")
     vertices, faces = mesh.vertices, mesh.faces
     # trimesh omits a text file's last solid if it is truncated.
     facets = re.finditer(rb"\bfacet\s+normal\b", data, re.IGNORECASE)

@@ -20,7 +20,8 @@ from jaxtyping import Bool, Int
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, RGBImage, read_picture
-from dopepp.parts.mesh import Faces, RawMesh, Vertices
+from dopepp.parts.mesh import Faces, Vertices
+from dopepp.parts.part import RawMesh
 
 MAX_OFF_BYTES: Final = 50_000_000  # size of an OFF file; parsing needs 15 times as much
 MAX_MATERIAL_BYTES: Final = 10_000_000  # a hundred thousand materials; bounds memory

@@ -15,8 +15,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dopepp.parts.mesh import RawMesh
 from dopepp.parts.mesh.obj import companion_path, fans, read_texture
+from dopepp.parts.part import RawMesh
 
 TYPES: Final = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",

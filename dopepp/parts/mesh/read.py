@@ -19,11 +19,11 @@ from jaxtyping import Bool, Float, Int
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_limited
-from dopepp.parts.mesh import Faces, Mesh, Points, RawMesh, Vertices, connected, face_areas, weld
+from dopepp.parts.mesh import Faces, Points, Vertices, connected, face_areas, weld
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
 from dopepp.parts.mesh.obj import read_obj, read_off
 from dopepp.parts.mesh.ply import read_ply
-from dopepp.parts.part import UNITS, Part, make_part
+from dopepp.parts.part import UNITS, Mesh, Part, RawMesh, make_part
 
 logger = logging.getLogger(__name__)
 ASSUMED_UNIT: Final = "mm"  # Unit of most CAD files that cannot state a unit

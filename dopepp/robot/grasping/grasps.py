@@ -35,8 +35,7 @@ from dopepp.core.validation import STRICT, Range, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 from dopepp.virtual.body import make_body
 
 MAX_GRASPS: Final = 1000
@@ -62,10 +61,8 @@ FINGER: Final = 0.025  # thickness of a finger behind its pad, metres
 # Opposite corners of the gripper body's box, tool axes, relative to the pads' ends, metres.
 PALM: Final = np.array([[-0.075, -0.04, -0.16], [0.075, 0.04, -0.055]])
 FLAT: Final = math.cos(FRICTION_ANGLE)
-MIN_DIFFERENCE: Final = (
-    0.008,
-    math.radians(20.0),
-)  # metres or radians between distinct grasps of a face
+# Smallest distance (metres) or angle (radians) between distinct grasps of a face.
+DISTINCT: Final = (0.008, math.radians(20.0))
 BUILT_IN: Final = Path(__file__).parent / "data"
 Points = Float[np.ndarray, "n 3"]
 FIX: Final = "correct the file, or create a new file with `dopepp grasp propose`"
@@ -306,8 +303,8 @@ def _score(
 
 
 def _select_distinct(scored: list[tuple[float, Grasp]], count: int) -> list[Grasp]:
-    """Return the ``count`` best grasps that differ by at least :data:`MIN_DIFFERENCE`."""
-    distance, cosine = MIN_DIFFERENCE[0], math.cos(MIN_DIFFERENCE[1])
+    """Return the ``count`` best grasps that differ by at least :data:`DISTINCT`."""
+    distance, cosine = DISTINCT[0], math.cos(DISTINCT[1])
     distinct: list[Grasp] = []
     for _, grasp in sorted(scored, key=lambda pair: -pair[0]):
         if len(distinct) == count:

@@ -43,7 +43,7 @@ TRUE_K: Final[CameraMatrix] = camera_matrix(FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SI
 MOUNT: Final = make_transform(np.eye(3), np.array([0.0, 0.09, 0.11]))
 BRACKET: Final = (np.radians(1.0), 0.003)  # standard deviations about and along each axis
 ZERO: Final = np.radians(0.02)  # standard deviation of a joint's zero: 0.3 mm at the flange
-TOUCH_DEVIATION: Final = 1e-4  # standard deviation of a touched point along each axis, metres
+TOUCH: Final = 1e-4  # standard deviation of a touched point along each axis, metres
 TOUCHES, VIEWS = 8, 15  # number of touched points per calibration, and of images of the board
 BOARD: Final = "charuco:8x6:20:15"
 _DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that points straight down
@@ -110,7 +110,7 @@ def _pivot_poses(robot: TrueRobot, arm: Arm, rng: Generator) -> Float[np.ndarray
 
     def draw() -> FlangePair | None:
         angle = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
-        touched = TRAY + np.array([0.0, 0.0, 0.05]) + rng.normal(0, TOUCH_DEVIATION, 3)
+        touched = TRAY + np.array([0.0, 0.0, 0.05]) + rng.normal(0, TOUCH, 3)
         return _move(robot, arm, make_transform(_DOWN @ angle, touched - _DOWN @ angle @ robot.tip))
 
     return np.stack([read for _, read in _draw_reachable(draw, TOUCHES)])
@@ -122,9 +122,7 @@ def _touch_bench(
     """Return measured points of the bench, base frame, metres; ``tip`` is the calibrated tip."""
 
     def draw() -> FlangePair | None:
-        touched = (
-            TRAY + np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]) + rng.normal(0, TOUCH_DEVIATION, 3)
-        )
+        touched = TRAY + np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]) + rng.normal(0, TOUCH, 3)
         return _move(robot, arm, make_transform(_DOWN, touched - _DOWN @ robot.tip))
 
     return np.stack([transform(read, tip) for _, read in _draw_reachable(draw, TOUCHES)])

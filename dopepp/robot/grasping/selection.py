@@ -31,9 +31,7 @@ from dopepp.robot.grasping.unexplained import Unexplained
 
 MAX_OFFSET: Final = 0.003  # largest horizontal distance of a point above another point, metres
 MIN_HEIGHT: Final = 0.002  # smallest height of a point above another point, metres
-MAX_MOTION: Final = (
-    0.01  # largest distance between two estimates of a part that has not moved, metres
-)
+MAX_MOTION: Final = 0.01  # distance between two estimates of a part that has not moved, metres
 RETRY_FACTOR: Final = 0.3  # factor on the score of a part for each failed attempt to grasp it
 VIEW_TILTS: Final = np.radians([15.0, 25.0, 35.0])  # tilt of the camera on each ring, radians
 NUM_AZIMUTHS: Final = 8  # number of candidates on each ring

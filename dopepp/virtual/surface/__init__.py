@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float, Float32, Int
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh import Faces, Mesh, Points, Vertices, connected, largest_distance
+from dopepp.parts.mesh import Faces, Points, Vertices, connected, largest_distance
 from dopepp.parts.mesh.read import find_topology
+from dopepp.parts.part import Mesh
 from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture

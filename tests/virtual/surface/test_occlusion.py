@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from manifold3d import Manifold
 
-from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface
 from dopepp.virtual.surface.occlusion import look_up_sky, spread_directions
 

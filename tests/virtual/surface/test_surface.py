@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface
 from tests.parts.makers import mesh_of
 

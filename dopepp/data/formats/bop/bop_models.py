@@ -25,9 +25,8 @@ from dopepp.data.formats.bop import EXACT, INEXACT, MM, is_number
 from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Node, Problems, mapping
 from dopepp.geometry.rotation import is_rotation, nearest_rotation
-from dopepp.parts.mesh import Mesh
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import MAX_SYMMETRIES, Part, check_name, make_part
+from dopepp.parts.part import MAX_SYMMETRIES, Mesh, Part, check_name, make_part
 
 _log = logging.getLogger(__name__)
 

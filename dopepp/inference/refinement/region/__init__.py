@@ -64,7 +64,7 @@ MIN_AGREEMENT: Final = 0.85
 MIN_SUPPORT: Final = 0.35
 MIN_SUPPORT_GAIN: Final = 0.02
 
-EXTENDED_DEVIATIONS: Final = 3.0
+SPREAD: Final = 3.0
 """Additional standard deviations of the extended search, as multiples of those of a pose without
 covariance."""
 
@@ -133,9 +133,7 @@ class RegionRefiner:
                 floor = np.diag(np.repeat([1e-5**2, 1e-6**2], 3))
                 prior = Prior(given, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
             # A weaker prior (larger covariance) at the same pose.
-            weak = np.linalg.inv(prior.information) + EXTENDED_DEVIATIONS**2 * np.linalg.inv(
-                broad.information
-            )
+            weak = np.linalg.inv(prior.information) + SPREAD**2 * np.linalg.inv(broad.information)
             wide_prior = Prior(given, np.linalg.inv(weak))
             rounds = self.rounds(image, K, given, FOLLOWED if followed else FOUND)
             return refinement(*_search(rounds, prior, wide_prior, starts))
@@ -291,7 +289,7 @@ def _search_far(
         former_agreement = last.agreement(given, search_px) if nearby is None else nearby[1]
         least_support = max(MIN_SUPPORT, former_agreement.support + MIN_SUPPORT_GAIN)
         first.learn(given, search_px)
-        further_starts = [*starts, *wide_prior.draws(1 / EXTENDED_DEVIATIONS, NUM_DRAWS)]
+        further_starts = [*starts, *wide_prior.draws(1 / SPREAD, NUM_DRAWS)]
         further_starts.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
         coarse_ends = []
         for start in (given, *further_starts[:NUM_STARTS]):

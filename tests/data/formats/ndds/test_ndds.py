@@ -17,8 +17,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats.ndds.ndds_reader import NddsReader
 from dopepp.data.formats.ndds.ndds_writer import NddsWriter
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
-from dopepp.parts.mesh import Mesh
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import Mesh, Part, make_part
 from tests.data.makers import edit_json, pose_at, write_set
 
 WIDTH, HEIGHT = 160, 120

@@ -14,7 +14,7 @@ from dopepp.geometry.camera import make_transform, project, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.parts import load_part
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.mesh import Mesh
+from dopepp.parts.part import Mesh
 from dopepp.virtual import make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.renderers.raster import visibility as shadow_module
