@@ -20,12 +20,14 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator, SeenMaps
 from dopepp.inference.network_input import (
     METRES,
     Depth,
     Distances,
     Region,
+    are_same,
     check_region,
     merge_scales,
 )
@@ -42,6 +44,8 @@ from dopepp.recovery.recover import Reason
 NUM_REFINED: Final = 20  # number of start poses of each part that are refined
 NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable
 REPEATS: Final = 2  # number of further refinements
+COMPARABLE: Final = 2.0  # difference of log odds below which look-alikes are compared
+LOOK_ALIKE: Final = math.radians(45.0)  # smallest rotation between the poses of look-alikes
 
 SCALE_ERROR: Final = 0.001
 """Default of ``scale_error``. It is small, so that refinement corrects the distance, because
@@ -177,7 +181,8 @@ class TemplateEstimator(PoseEstimator):
                 else poses[number]
                 for rank, number in enumerate(chosen)
             ]
-            ends += group + self._half_turned(detector, group, image, K, depth)
+            group += self._half_turned(detector, group, image, K, depth)
+            ends += self._without_look_alikes(detector, group, image, K)
         return ends
 
     def _most_promising(
@@ -222,7 +227,7 @@ class TemplateEstimator(PoseEstimator):
         K: CameraMatrix,
         depth: Depth | None,
     ) -> list[Detection]:
-        """Refine the best pose after half turns, and return the most probable result.
+        """Refine the best pose after half turns.
 
         See :meth:`TemplateDetector.half_turned`.
         """
@@ -231,8 +236,30 @@ class TemplateEstimator(PoseEstimator):
         best = max(ends, key=partial(_evidence, detector))
         turned = detector.half_turned(best.T_cam_obj)
         starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
-        poses = sorted(super().refined(starts, image, K, depth), key=_probability, reverse=True)
-        return [self._refined_again(detector, pose, image, K, depth) for pose in poses[:1]]
+        poses = super().refined(starts, image, K, depth)
+        return [self._refined_again(detector, pose, image, K, depth) for pose in poses]
+
+    def _without_look_alikes(
+        self, detector: TemplateDetector, ends: list[Detection], image: RGBImage, K: CameraMatrix
+    ) -> list[Detection]:
+        """Remove poses of the best pose's instance, except the one whose distinctive lines fit.
+
+        Poses are compared if they belong to one instance, and have similar probabilities and very
+        different rotations, e.g. half turns. See :meth:`Verifier.prefers`.
+        """
+        if not ends:
+            return []
+        assert self.refiner is not None  # templates are always refined
+        evidence = [_evidence(detector, end) for end in ends]
+        order = sorted(range(len(ends)), key=lambda index: -evidence[index])
+        best = ends[order[0]]
+        same = [index for index in order if are_same(ends[index], best)]
+        for index in same:
+            turn = rotation_angle(ends[index].T_cam_obj[:3, :3].T @ best.T_cam_obj[:3, :3])
+            is_close = evidence[index] > evidence[order[0]] - COMPARABLE and turn > LOOK_ALIKE
+            if is_close and self.refiner.prefers(ends[index], best, image, K):
+                best = ends[index]
+        return [best] + [ends[index] for index in order if index not in same]
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""

@@ -85,6 +85,23 @@ def test_the_best_pose_is_refined_after_half_turns(near_truth, estimator, render
     assert best.score > wrong.score
 
 
+def test_distinctive_lines_decide_between_equally_probable_poses(near_truth, estimator, rendered):
+    image, K, truth = rendered.image, rendered.scene.K, true_pose(rendered)
+    (detector,) = estimator.detectors
+    poses = [truth @ np.diag([-1.0, 1.0, -1.0, 1.0]), truth, truth.copy()]
+    poses[2][0, 3] += 0.2  # another instance
+    ends = [
+        replace(detector.start(pose, 0.5, K), probability=probability)
+        for pose, probability in zip(poses, (0.9, 0.85, 0.8), strict=True)
+    ]
+    kept = estimator._without_look_alikes(detector, ends, image, K)
+    assert [id(end) for end in kept] == [id(ends[1]), id(ends[2])]
+    ends[1] = replace(ends[1], probability=0.5)  # too improbable to be compared
+    kept = estimator._without_look_alikes(detector, ends, image, K)
+    assert [id(end) for end in kept] == [id(ends[0]), id(ends[2])]
+    assert estimator._without_look_alikes(detector, [], image, K) == []
+
+
 def test_the_given_distances_replace_the_working_distance(estimator, rendered):
     estimator.candidates(rendered.image, rendered.scene.K, distances=(0.2, 0.3))
     estimator.candidates(rendered.image, rendered.scene.K, distances="any")

@@ -33,7 +33,7 @@ from dopepp.inference.templates.matching import (
     Matches,
     match,
 )
-from dopepp.inference.templates.ranking import FEATURES, improve_views, move_nearby
+from dopepp.inference.templates.ranking import FEATURES, improve_views, learned_ranking, move_nearby
 from dopepp.inference.templates.responses import BINS, edge_responses
 from dopepp.inference.templates.views import (
     DRAWN_PX,
@@ -324,6 +324,23 @@ def test_a_match_becomes_the_pose_at_its_pixel_size_and_turn(detector):
         to_ray = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.arccos(ray[2]))
         expected = to_ray * Rotation.from_euler("z", turn) * Rotation.from_matrix(R)
         np.testing.assert_allclose(T[:3, :3], expected.as_matrix(), atol=1e-9)
+
+
+def test_a_match_with_low_normalised_edges_is_a_start(detector, rendered, monkeypatch):
+    image, K, _ = rendered
+    views, poses, features = detector.ranked(image, K, DISTANCES)
+    weights = learned_ranking().weights
+    edges, supported = FEATURES.index("edges"), FEATURES.index("supported")
+    narrow = int(np.argmin(features @ weights))
+    features[narrow, supported] += 100 / weights[supported]
+    features[narrow, edges] -= 200 / weights[edges]
+    monkeypatch.setattr(detector, "ranked", lambda *_: (views, poses, features))
+    *others, last = detector.detect(image, K)
+    T_cam_obj = detector.transforms(views[[narrow]], poses[[narrow]], K)[0]
+    np.testing.assert_allclose(last.T_cam_obj, T_cam_obj)
+    scores = [start.score for start in others]
+    assert scores == sorted(scores, reverse=True)
+    assert last.score < scores[-1]
 
 
 def test_refined_start_pose_is_the_true_pose(detector, rendered):

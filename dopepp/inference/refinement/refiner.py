@@ -160,6 +160,14 @@ class Refiner:
         assert region is not None  # the caller requires the term ``region``
         return region.coarse_fit(image, K, detection.T_cam_obj, detection.covariance)
 
+    def prefers(
+        self, first: Detection, second: Detection, image: RGBImage, K: CameraMatrix
+    ) -> bool:
+        """Compare two similar poses of a part; see :meth:`Verifier.prefers`."""
+        verifier = self._refiners[first.object].verifier
+        assert verifier is not None  # the caller requires the term ``region``
+        return verifier.prefers(image, K, first.T_cam_obj, second.T_cam_obj)
+
     def refine_views(
         self,
         name: str,

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, Int16, UInt8
+from jaxtyping import Bool, Float, Int, Int16, UInt8
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix, Transform, resize_camera
 from dopepp.inference.refinement.colour import SMALLEST_PX, crop_around, log_odds
 from dopepp.inference.refinement.outline import (
     Contour,
@@ -68,6 +68,9 @@ RING: Final = 0.2  # width of the surroundings, share of the extent
 MAX_PIXELS: Final = 1500  # largest number of pixels for the fit of the shading model
 SECTORS: Final = 8
 MIN_POINTS: Final = 12  # smallest number of outline points on the image
+COMPARED_PX: Final = 300  # approximate length of the part where two poses are compared
+APART: Final = 0.02  # distance of distinctive lines from other lines, share of the extent
+CLEARLY: Final = 0.1  # difference of mean responses above which a pose is preferred
 SCHARR: Final = 1 / 32  # grey levels per pixel in a sum of Scharr's kernel
 
 Gradients = tuple[Int16[np.ndarray, "height width 3"], Int16[np.ndarray, "height width 3"]]
@@ -175,6 +178,69 @@ class Verifier:
         if evidence is None:
             return 0.0
         return float(1 / (1 + np.exp(-learned_model().log_odds(evidence))))
+
+    def prefers(
+        self, image: RGBImage, K: CameraMatrix, first: Transform, second: Transform
+    ) -> bool:
+        """Return whether the lines that distinguish two similar poses are those of the first.
+
+        The poses of look-alikes share most lines, so their probabilities are nearly equal. Only
+        lines that are apart from the lines of the other pose distinguish them, e.g. the edges of
+        a small hole. The mean response of the first pose's must exceed that of the second's. A pose
+        without such lines has half the mean response of the shared lines.
+
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            first: Pose T_cam_obj, metres.
+            second: Pose T_cam_obj, metres.
+        """
+        seen = [at for at in (posed(self.mesh, pose, K) for pose in (first, second)) if at]
+        pixels = np.concatenate([at.pixels for at in seen]) if len(seen) == 2 else np.zeros((1, 2))
+        try:
+            corners = np.array([pixels.min(axis=0), pixels.max(axis=0)])
+            crop = crop_around(image, K, corners, COMPARED_PX)
+        except UndecidedError:
+            return False
+        factor = max(1, round(COMPARED_PX / crop.extent))  # small holes need many pixels
+        size, K = tuple(factor * side for side in crop.size), resize_camera(crop.K, factor, factor)
+        gx, gy = _gradients(
+            np.asarray(cv2.resize(crop.colours, size, interpolation=cv2.INTER_CUBIC))
+        )
+        strengths = factor * SCHARR * np.hypot(gx, gy).max(axis=2)
+        responses = strengths / (strengths + NOISE)
+        drawn = [self._line_pixels(pose, K, size) for pose in (first, second)]
+        distinctive, shared = [], []
+        for lines, others in zip(drawn, drawn[::-1], strict=True):
+            distance = cv2.distanceTransform((~others).astype(np.uint8), cv2.DIST_L2, 3)
+            is_apart = distance > APART * factor * crop.extent
+            distinctive.append(responses[lines & is_apart])
+            shared.append(responses[lines & ~is_apart])
+        common = np.concatenate(shared)
+        level = common.mean() / 2 if len(common) else 0.0
+        means = [values.mean() if len(values) else level for values in distinctive]
+        return bool(means[0] > means[1] + CLEARLY)
+
+    def _line_pixels(
+        self, pose: Transform, K: CameraMatrix, size: tuple[int, int]
+    ) -> Bool[np.ndarray, "height width"]:
+        """Return the pixels of outline and visible creases: the normal changes to the next pixel.
+
+        Args:
+            pose: T_cam_obj, metres.
+            K: Camera matrix, pixels.
+            size: Width and height, pixels.
+        """
+        at = posed(self.mesh, pose, K)
+        assert at is not None  # the caller has projected the part
+        ids = self._edges.drawn(at, size)
+        on_part = ids >= 0
+        normals = np.where(on_part[..., None], self._normals[ids], 0.0)
+        lines = np.zeros_like(on_part)
+        for here, there in (np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:]):
+            cosines = np.einsum("hwi,hwi->hw", normals[here], normals[there])
+            lines[here] |= (cosines < SHARP) & (on_part[here] | on_part[there])
+        return lines
 
     def evidence(
         self,

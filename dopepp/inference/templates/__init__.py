@@ -38,6 +38,7 @@ from dopepp.inference.network_input import MAX_PIXELS, Region
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import (
+    FEATURES,
     Features,
     improve_views,
     learned_ranking,
@@ -65,7 +66,7 @@ FINE_SPREAD: Final = 3  # `spread` of the edges in the ranking, pixels
 NUM_RANKED: Final = 16000  # best matches that are ranked
 NUM_TURNED: Final = 1000  # best matches of each octave that are compared with neighbouring views
 EXTENT: Final = 2.5  # added to the score per diameter of a view's extent, standard deviations
-NUM_STARTS: Final = 60  # start poses
+NUM_STARTS: Final = 200  # start poses
 
 # Two start poses that differ by less are duplicates: refinement would move both to the same pose.
 SAME_PLACE: Final = 0.1  # diameters
@@ -147,10 +148,15 @@ class TemplateDetector:
         )
         model = learned_ranking()
         odds = features @ model.weights + model.bias
-        order = np.argsort(-odds)
+        # The normalised edges of narrow views are low, because straight lines fit everywhere. The
+        # best matches with and without this feature therefore take turns.
+        edges = FEATURES.index("edges")
+        ranks = [np.argsort(-odds), np.argsort(features[:, edges] * model.weights[edges] - odds)]
+        order = np.array(list(dict.fromkeys(np.column_stack(ranks).ravel().tolist())))
         transforms = self.transforms(views[order], poses[order], crop_camera(K, left, top))
         scores = 1 / (1 + np.exp(-np.clip(odds[order], -30.0, 30.0)))
         chosen = distinct_poses(transforms, self.part, NUM_STARTS)
+        chosen.sort(key=lambda index: -scores[index])
         return [self.start(transforms[i], float(scores[i]), K) for i in chosen]
 
     def start(self, T_cam_obj: Transform, score: float, K: CameraMatrix) -> Detection:

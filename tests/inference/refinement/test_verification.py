@@ -110,6 +110,18 @@ def test_the_right_pose_has_more_evidence_than_a_wrong_pose(rendered, step):
     assert odds[0] > odds[1] + 1.0
 
 
+def test_the_lines_of_a_look_alike_are_not_preferred(rendered):
+    image, K, T = rendered
+    verifier = Verifier(make_outline_mesh(PART.mesh.vertices, PART.mesh.faces), PART.diameter)
+    half_turn = make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    look_alike, away = T @ half_turn, make_transform(T[:3, :3], np.array([5.0, 0.0, 0.3]))
+    assert verifier.prefers(image, K, T, look_alike)
+    assert not verifier.prefers(image, K, look_alike, T)
+    assert not verifier.prefers(image, K, T, T)  # no line distinguishes a pose from itself
+    assert not verifier.prefers(np.full_like(image, 90), K, T, look_alike)
+    assert not verifier.prefers(image, K, away, away)
+
+
 def test_a_refined_detection_has_its_probability(rendered):
     image, K, T = rendered
     pixels = project(transform(T, PART.cuboid), K)
