@@ -203,7 +203,8 @@ class Verifier:
         except UndecidedError:
             return False
         factor = max(1, round(COMPARED_PX / crop.extent))  # small holes need many pixels
-        size, K = tuple(factor * side for side in crop.size), resize_camera(crop.K, factor, factor)
+        size = factor * crop.size[0], factor * crop.size[1]
+        K = resize_camera(crop.K, factor, factor)
         gx, gy = _gradients(
             np.asarray(cv2.resize(crop.colours, size, interpolation=cv2.INTER_CUBIC))
         )
