@@ -44,8 +44,8 @@ from dopepp.recovery.recover import Reason
 NUM_REFINED: Final = 20  # number of start poses of each part that are refined
 NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable
 REPEATS: Final = 2  # number of further refinements
-COMPARABLE: Final = 2.0  # difference of log odds below which look-alikes are compared
-LOOK_ALIKE: Final = math.radians(45.0)  # smallest rotation between the poses of look-alikes
+MAX_DIFFERENCE: Final = 2.0  # difference of log odds below which look-alikes are compared
+MIN_TURN: Final = math.radians(45.0)  # smallest rotation between the poses of look-alikes
 
 SCALE_ERROR: Final = 0.001
 """Default of ``scale_error``. It is small, so that refinement corrects the distance, because
@@ -256,7 +256,7 @@ class TemplateEstimator(PoseEstimator):
         same = [index for index in order if are_same(ends[index], best)]
         for index in same:
             turn = rotation_angle(ends[index].T_cam_obj[:3, :3].T @ best.T_cam_obj[:3, :3])
-            is_close = evidence[index] > evidence[order[0]] - COMPARABLE and turn > LOOK_ALIKE
+            is_close = evidence[index] > evidence[order[0]] - MAX_DIFFERENCE and turn > MIN_TURN
             if is_close and self.refiner.prefers(ends[index], best, image, K):
                 best = ends[index]
         return [best] + [ends[index] for index in order if index not in same]

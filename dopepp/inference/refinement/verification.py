@@ -69,8 +69,8 @@ MAX_PIXELS: Final = 1500  # largest number of pixels for the fit of the shading 
 SECTORS: Final = 8
 MIN_POINTS: Final = 12  # smallest number of outline points on the image
 COMPARED_PX: Final = 300  # approximate length of the part where two poses are compared
-APART: Final = 0.02  # distance of distinctive lines from other lines, share of the extent
-CLEARLY: Final = 0.1  # difference of mean responses above which a pose is preferred
+MIN_DISTANCE: Final = 0.02  # distance of distinctive lines from other lines, share of the extent
+MIN_DIFFERENCE: Final = 0.1  # difference of mean responses above which a pose is preferred
 SCHARR: Final = 1 / 32  # grey levels per pixel in a sum of Scharr's kernel
 
 Gradients = tuple[Int16[np.ndarray, "height width 3"], Int16[np.ndarray, "height width 3"]]
@@ -195,32 +195,33 @@ class Verifier:
             first: Pose T_cam_obj, metres.
             second: Pose T_cam_obj, metres.
         """
-        seen = [at for at in (posed(self.mesh, pose, K) for pose in (first, second)) if at]
-        pixels = np.concatenate([at.pixels for at in seen]) if len(seen) == 2 else np.zeros((1, 2))
+        one, other = posed(self.mesh, first, K), posed(self.mesh, second, K)
+        if one is None or other is None:
+            return False
+        pixels = np.concatenate([one.pixels, other.pixels])
+        corners = np.array([pixels.min(axis=0), pixels.max(axis=0)])
         try:
-            corners = np.array([pixels.min(axis=0), pixels.max(axis=0)])
             crop = crop_around(image, K, corners, COMPARED_PX)
         except UndecidedError:
             return False
         factor = max(1, round(COMPARED_PX / crop.extent))  # small holes need many pixels
         size = factor * crop.size[0], factor * crop.size[1]
         K = resize_camera(crop.K, factor, factor)
-        gx, gy = _gradients(
-            np.asarray(cv2.resize(crop.colours, size, interpolation=cv2.INTER_CUBIC))
-        )
+        enlarged = np.asarray(cv2.resize(crop.colours, size, interpolation=cv2.INTER_CUBIC))
+        gx, gy = _gradients(enlarged)
         strengths = factor * SCHARR * np.hypot(gx, gy).max(axis=2)
         responses = strengths / (strengths + NOISE)
         drawn = [self._line_pixels(pose, K, size) for pose in (first, second)]
         distinctive, shared = [], []
         for lines, others in zip(drawn, drawn[::-1], strict=True):
             distance = cv2.distanceTransform((~others).astype(np.uint8), cv2.DIST_L2, 3)
-            is_apart = distance > APART * factor * crop.extent
+            is_apart = distance > MIN_DISTANCE * factor * crop.extent
             distinctive.append(responses[lines & is_apart])
             shared.append(responses[lines & ~is_apart])
         common = np.concatenate(shared)
         level = common.mean() / 2 if len(common) else 0.0
         means = [values.mean() if len(values) else level for values in distinctive]
-        return bool(means[0] > means[1] + CLEARLY)
+        return bool(means[0] > means[1] + MIN_DIFFERENCE)
 
     def _line_pixels(
         self, pose: Transform, K: CameraMatrix, size: tuple[int, int]
