@@ -105,14 +105,16 @@ def load_estimator(
 
 def distance_range(text: str | None) -> tuple[float, float] | None:
     """Parse the value of ``--working-distance``, if any."""
-    allowed = "NEAR,FAR in metres"
-    return None if text is None else two_numbers("--working-distance", text, allowed, "0.3,0.5")
+    if text is None:
+        return None
+    pair = text.strip("[]")  # train.py takes the distances in brackets
+    return two_numbers("--working-distance", pair, "NEAR,FAR in metres", "0.3,0.5")
 
 
 def two_numbers(option: str, text: str, allowed: str, example: str) -> tuple[float, float]:
     """Parse the value of an option that consists of two numbers with a comma between them."""
     try:
-        first, second = map(float, text.strip("[]").split(","))
+        first, second = map(float, text.split(","))
     except ValueError:
         raise UserError(
             f"{option} {text:.100}", allowed, f"write e.g. {option} {example}"
