@@ -74,8 +74,9 @@ def options_page() -> str:
         "# Options",
         "An option is typed as `name=value` after `python train.py` or `python evaluate.py`; a "
         "group's choice as `group=choice`. `--cfg job` prints the whole configuration of a "
-        "command. A unit in brackets, e.g. [metres], follows the meaning; two numbers "
-        "`[low,high]` are the range of a random value.",
+        "command; an option that it does not print needs a leading `+`, e.g. "
+        "`+trainer.num_nodes=2`. A unit in brackets, e.g. [metres], follows the meaning; two "
+        "numbers `[low,high]` are the range of a random value.",
         "## Choices",
     ]
     for folder in sorted(path for path in (ROOT / "conf").rglob("*") if path.is_dir()):

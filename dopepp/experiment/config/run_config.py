@@ -239,8 +239,6 @@ class MeasurementConfig(FalsePositiveTarget):
         plain: The whole config as nested dictionaries and lists, as printed and stored.
         shading: Shares of every object's visible area to cover; each share is evaluated (default:
             none).
-        scale_factors: Factors on the apparent size of the parts; each factor is evaluated (default:
-            none). ``scale`` is the short name.
         by: Quantities by which the pass rates are broken down: distance, visibility, size, rotation
             (default: none).
         num_bins: Number of bins of each quantity in ``by``.
@@ -254,7 +252,6 @@ class MeasurementConfig(FalsePositiveTarget):
     __pydantic_config__ = STRICT
     plain: Mapping[str, Any] = field(default_factory=dict)
     shading: Any = None
-    scale_factors: Any = None
     by: Any = None
     num_bins: Any = 5
     tune: bool
@@ -355,6 +352,8 @@ class EvaluationConfig(MeasurementConfig):
         results: BOP challenge CSV with the poses of another method.
         templates: Nearest and farthest distance of the parts, metres, for the method that matches
             templates of their meshes; None omits the method.
+        scale_factors: Factors on the apparent size of the parts; each factor is evaluated (default:
+            none). ``scale`` is the short name.
         negatives: Folder of images that show none of the parts.
         negatives_camera: Camera file of these images; None for the camera of the data.
         method: Name of the method of ``results``; None derives the name from the file name.
@@ -373,6 +372,7 @@ class EvaluationConfig(MeasurementConfig):
     baseline: str | None
     results: str | None
     templates: tuple[float, float] | None = None
+    scale_factors: Any = None
     negatives: str | None = None
     negatives_camera: str | None = None
     method: Any = None

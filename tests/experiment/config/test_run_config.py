@@ -88,6 +88,10 @@ def test_values_are_typed_and_the_plain_config_is_unchanged(composed):
     assert (config.ema, config.logger, config.search) == (0.5, None, None)
 
 
+def test_classes_of_ndds_are_typed_as_on_the_page(parsed):
+    assert parsed("data=ndds", "data.classes={Mug_01: mug}").data.classes == {"Mug_01": "mug"}
+
+
 OPTIONS: dict[str, Any] = {"shading": None, "by": None, "num_bins": 5, "scale_factors": None}
 SHARES = r"shading=.*; allowed: shares .* 0 to 1"
 FACTORS = r"scale=.*; allowed: factors from 0\.05 to 20"
