@@ -82,8 +82,13 @@ def _resumed(arguments: list[str], run: Path) -> list[str]:
     overrides = read_overrides(run)
     if overrides is None:
         return arguments  # the run reports the problem with the folder
-    # Hydra must not write into the run before the checks of resuming have passed.
-    return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
+    # Hydra must not write into the run before the checks of resuming have passed. The experiment of
+    # a multirun's job may select the mode MULTIRUN, but the job is resumed by itself.
+    fixed = [f"hydra.run.dir={run}", "hydra.output_subdir=null", "hydra.mode=RUN"]
+    # Hydra's parser rejects overrides on both sides of an option such as --cfg.
+    first = next(i for i, text in enumerate(arguments) if "=" in text and text[0] != "-")
+    given = [text for text in arguments[first:] if not text.startswith("hydra.run.dir=")]
+    return [*arguments[:first], *overrides, *fixed, *given]
 
 
 def convert_error(error: Exception) -> UserError:

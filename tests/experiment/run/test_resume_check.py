@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,13 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.results.folder import CONFIG_FILE, write_config
+from dopepp.experiment.command_line import prepare
+from dopepp.experiment.results.folder import (
+    CONFIG_FILE,
+    OVERRIDES_FILE,
+    write_config,
+    write_json,
+)
 from dopepp.experiment.run.resume import (
     check_resume,
     config_differences,
@@ -178,6 +185,17 @@ def test_overrides_of_the_task_are_kept():
         "resume=/x", "resume_anyway=true", "hydra.run.dir=/x",
     ]  # fmt: skip
     assert trusted_overrides(stored, Path("overrides.yaml")) == stored[:10]
+
+
+def test_a_job_of_a_table_is_resumed_by_itself_and_beside_options(tmp_path, monkeypatch):
+    stored = ["experiment=table6_dope_vs_dopepp", "model=dope"]
+    write_json(tmp_path / OVERRIDES_FILE, {"overrides": stored})
+    given = [f"resume={tmp_path}", "hydra.run.dir=/elsewhere", "seed=2"]
+    monkeypatch.setattr("sys.argv", ["train.py", "--cfg", "hydra", *given, "--resolve"])
+    prepare([], {}, 1)
+    fixed = [f"hydra.run.dir={tmp_path}", "hydra.output_subdir=null", "hydra.mode=RUN"]
+    words = ["--cfg", "hydra", *stored, *fixed, given[0], "seed=2", "--resolve"]
+    assert sys.argv[1:] == words
 
 
 OF_HYDRA = (
