@@ -170,6 +170,8 @@ def _train(
         for tracker in trackers:
             tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
+    for line in template_commands(config.data):
+        display.console.print(f"available now, without training: {line}", soft_wrap=True)
     _fit(trainer, system, datamodule, resume_from, run_dir)
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import RunError, UserError
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
@@ -15,6 +15,7 @@ from dopepp.experiment.assembly.build_sources import (
     held_out_source,
 )
 from dopepp.experiment.config.data_config import evaluation_data
+from dopepp.experiment.run import train
 from dopepp.experiment.run.train import template_commands
 from dopepp.parts.catalogue import pivconnector
 
@@ -63,6 +64,16 @@ def test_template_commands(my_part):
     assert command.startswith("dopepp predict 'my part.stl' IMAGE --K ")
     assert " --unit inch " in command
     assert template_commands(replace(data, virtual=replace(data.virtual, camera=None))) == []
+
+
+def test_a_run_prints_the_command_of_templates(my_part, monkeypatch, capsys, tmp_path):
+    def stop(*_):
+        raise RunError("stop")
+
+    monkeypatch.setattr(train, "_fit", stop)
+    with pytest.raises(RunError, match="stop"):
+        train.run_training(my_part(), tmp_path)
+    assert "without training: dopepp predict pivconnector IMAGE --K" in capsys.readouterr().out
 
 
 def test_automatic_sizes_are_stored_in_config_and_checkpoint(my_part, camera, caplog):
