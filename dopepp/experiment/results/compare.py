@@ -35,6 +35,7 @@ from dopepp.experiment.config.data_config import evaluation_data, stored_config
 from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import (
     BASELINE,
+    TABLE_FILE,
     Entry,
     Run,
     baseline_first,
@@ -48,9 +49,9 @@ from dopepp.experiment.results.pages import write_page
 from dopepp.experiment.results.paper import PaperTable, write_paper_table
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.models.checkpoint import find
 from dopepp.recovery.detection import Detection
 
-TABLE_FILE: Final = "compare.csv"
 TEXT_FILE: Final = "compare.md"
 CURVES_FILE: Final = "compare_auc.png"
 PANELS_FILE: Final = "compare.png"
@@ -247,11 +248,11 @@ class _Model:
         self.estimator: PoseEstimator | None = None
         self.run = next((run for run in entry.runs if _parts(run) == parts), entry.runs[0])
         path = self.run.checkpoint
-        if not path.is_file():
-            self.reason = entry.failure or f"no file {path}"
-            return
         try:
-            self.estimator, self.reason = PoseEstimator.load(path), ""
+            if find(path).exists():  # a file, a released network or the folder of an export
+                self.estimator, self.reason = PoseEstimator.load(path), ""
+            else:
+                self.reason = entry.failure or f"no file {path}"
         except UserError as error:
             self.reason = str(error)
 

@@ -30,6 +30,7 @@ from dopepp.experiment.results.folder import (
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.report import Cost, Report
 
+TABLE_FILE: Final = "compare.csv"
 BASELINE: Final = "dope"  # default name of the baseline: the first method, to which every Δ refers
 
 _HYDRA: Final = ".hydra"
@@ -107,8 +108,18 @@ class Entry:
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
     """Read the runs in folders of training runs, evaluations and multiruns, each folder once."""
-    folders = {folder.resolve(): folder for path in paths for folder in _folders(path)}
-    return [read_run(folder) for folder in folders.values()]
+    found = {path: _folders(path) for path in paths}
+    for path, folders in found.items():
+        # ``outputs/compare/*`` also matches the folders of earlier comparisons.
+        is_comparison = (path / TABLE_FILE).is_file() and any(found.values())
+        if not folders and not is_comparison:
+            raise UserError(
+                f"{path}, which holds no run",
+                "the folder of a training run, an evaluation or a multirun",
+                "pass a folder with metrics.json or config.yaml in it",
+            )
+    once = {folder.resolve(): folder for folders in found.values() for folder in folders}
+    return [read_run(folder) for folder in once.values()]
 
 
 def _folders(path: Path) -> list[Path]:
@@ -117,12 +128,6 @@ def _folders(path: Path) -> list[Path]:
     if any((path / trace).exists() for trace in traces):
         return [path]
     jobs = [job for job in path.iterdir() if job.name.isdigit()] if path.is_dir() else []
-    if not jobs:
-        raise UserError(
-            f"{path}, which holds no run",
-            "the folder of a training run, an evaluation or a multirun",
-            "pass a folder with metrics.json or config.yaml in it",
-        )
     return sorted(jobs, key=lambda job: int(job.name))
 
 

@@ -20,8 +20,8 @@ from dopepp.core.files import read_csv
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.assembly.build_system import LOGGERS
 from dopepp.experiment.config.run_config import RunConfig
-from dopepp.experiment.results.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE, TABLE_FILE
-from dopepp.experiment.results.compared_runs import overrides_of
+from dopepp.experiment.results.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE
+from dopepp.experiment.results.compared_runs import TABLE_FILE, overrides_of
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.paper import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.results.report import Report

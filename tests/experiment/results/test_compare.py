@@ -18,6 +18,7 @@ from dopepp.experiment.results.compare import (
     compare_paths,
     compare_reports,
     compare_runs,
+    image_tiles,
     read_log_column,
 )
 from dopepp.experiment.results.compared_runs import Entry, find_runs, group, read_run, with_refined
@@ -224,6 +225,16 @@ def test_folders_count_once_and_folders_without_runs_are_rejected(tmp_path):
     assert len(find_runs([tmp_path, tmp_path / "0", tmp_path / "." / "0"])) == 1
 
 
+def test_an_earlier_comparison_among_the_folders_is_ignored(tmp_path):
+    comparison = tmp_path / "earlier"
+    comparison.mkdir()
+    (comparison / "compare.csv").touch()
+    with pytest.raises(UserError, match="earlier, which holds no run"):
+        find_runs([comparison])
+    run = write_run(tmp_path / "0", [], report_of("dopepp", GOOD))
+    assert [found.folder for found in find_runs([comparison, run])] == [run]
+
+
 def test_truncated_logs_are_read(tmp_path):
     path = tmp_path / "metrics.csv"
     assert read_log_column(path, "train/loss") == {}
@@ -252,6 +263,15 @@ def test_unfinished_runs_have_curves_and_bad_checkpoints_are_named(tmp_path):
     assert "dope: no file" in text
     assert "best.ckpt" in text
     assert cv2.imread(str(out / "compare.png")).shape[2] == 3
+
+
+def test_an_evaluated_release_is_found_for_the_images(tmp_path):
+    run = write_run(tmp_path, [], report_of("dopepp_fast", BAD))
+    write_config(run, {"ckpt_path": "pretrained/pivconnector"})
+    entry = Entry("dopepp_fast", runs=[read_run(run)])
+    tiles, reason = image_tiles([entry], 1)
+    assert reason == ""
+    assert len(tiles) == 1
 
 
 def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch):
