@@ -21,6 +21,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_file
 from dopepp.experiment import program
 from dopepp.experiment.config.run_config import RunConfig
+from dopepp.experiment.results.breakdown import QUANTITIES
 from dopepp.experiment.results.false_alarms import alarm_rows
 from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, read_json
 from dopepp.experiment.results.frame import markdown, shown_rows
@@ -53,9 +54,12 @@ FILES: Final = {
     "val_overlay.png": "validation images of the last epoch",
     "val_belief.png": "belief maps of these images: strongest corner and centroid",
     "val_auc.png": "errors on these images (numbers in `val_auc.csv`)",
+    "refined.png": "share of correct refined poses on validation images, over the training time",
     "shading.png": "pass rate of partly covered objects (`shading.csv`)",
+    "shading_examples.png": "the same images at every share, drawn as in `overlay.png`",
     "scale.png": "pass rate at other camera distances (`scale.csv`)",
     "scale_examples.png": "the same scenes at every scale, drawn as in `overlay.png`",
+    **{f"by_{name}.png": f"rates per bin of {name} (`by_{name}.csv`)" for name in QUANTITIES},
     "compare.md": "the methods side by side (numbers in `compare.csv`)",
     "table.md": "the methods in the layout of the paper, with the paper's values (`table.csv`)",
     "lr_finder.png": "loss against learning rate (numbers in `lr_finder.csv`)",
@@ -137,8 +141,11 @@ class RunReadme:
         lines = [f"{train} resume={run}  # continue"]
         if state == FINISHED:
             epochs = 2 * self._config.trainer.max_epochs
+            # Photographs may have no masks, which shading needs.
+            is_rendered = self._config.data.is_rendered("test")
+            shading = "'shading=[0.2,0.4,0.6,0.8]' " if is_rendered else ""
             lines = [
-                f"{evaluate} ckpt_path={best} shading=[0.2,0.4,0.6,0.8] by=[distance]",
+                f"{evaluate} ckpt_path={best} {shading}'by=[distance]'",
                 f"{train} resume={run} trainer.max_epochs={epochs}  # train for longer",
             ]
         return [

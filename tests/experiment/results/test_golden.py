@@ -45,7 +45,8 @@ GOOD = [0.005] * 30 + [np.inf] * 2
 BAD = [0.004] * 10 + [0.02] * 20 + [np.inf] * 2
 BEST = [0.001] * 32
 CONFIG: Any = SimpleNamespace(
-    model=SimpleNamespace(name="dopepp"), data=SimpleNamespace(name="hybrid"),
+    model=SimpleNamespace(name="dopepp"),
+    data=SimpleNamespace(name="hybrid", is_rendered=lambda split: True),
     trainer=SimpleNamespace(max_epochs=3), keep_checkpoints=True,
 )  # fmt: skip
 
@@ -429,6 +430,16 @@ def test_the_readme_is_not_written_before_the_run_begins(run, monkeypatch):
     page.begin()
     assert path.read_text().startswith("# dopepp on hybrid: running\n\nSince ")
     assert f"\ndopepp train resume='{run}'  # continue" in path.read_text()
+
+
+def test_shading_is_not_suggested_on_photographs(run):
+    data = SimpleNamespace(name="bop", is_rendered=lambda split: False)
+    page = pages.RunReadme(SimpleNamespace(**vars(CONFIG) | {"data": data}), run)
+    page.begin()
+    page.end(pages.FINISHED)
+    text = (run / pages.README_FILE).read_text()
+    assert "'by=[distance]'" in text
+    assert "'shading=" not in text
 
 
 def test_paths_are_relative_to_the_working_directory(run, monkeypatch):
