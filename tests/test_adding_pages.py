@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
+from dopepp.experiment import entries
 from dopepp.experiment.assembly.build_system import CALLBACKS
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.metrics.functional import distances
@@ -26,9 +27,9 @@ from dopepp.virtual.renderers import RENDERERS
 DOCS = Path(__file__).parents[1] / "docs" / "how-to"
 
 
-def documented(page):
-    """Return the first block of Python code of a page."""
-    return (DOCS / page).read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+def documented(page, number=1):
+    """Return a block of Python code of a page."""
+    return (DOCS / page).read_text(encoding="utf-8").split("```python\n")[number].split("```")[0]
 
 
 def module_of(page, name, monkeypatch):
@@ -120,3 +121,14 @@ def test_the_documented_callback_works(monkeypatch):
     )  # fmt: skip
     trainer.fit(OneWeight(), torch.utils.data.DataLoader(torch.zeros(2)))
     assert trainer.callback_metrics["train/gradient_norm"] == pytest.approx(3.0)
+
+
+def test_the_documented_script_allows_a_callback_and_trains(monkeypatch):
+    package, started = ModuleType("my_package"), []
+    package.callbacks = module_of("adding-a-callback.md", "my_package.callbacks", monkeypatch)
+    monkeypatch.setitem(sys.modules, "my_package", package)
+    monkeypatch.setattr(entries, "start", started.append)
+    monkeypatch.setattr(CALLBACKS, "_targets", {*CALLBACKS.targets})
+    exec(documented("adding-a-callback.md", 2))
+    assert started == ["train"]
+    assert "my_package.callbacks.GradientNorm" in CALLBACKS.targets
