@@ -18,12 +18,15 @@ SUFFIXES = (*IMAGES, ".tif", ".tiff")
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the sorted file names of a folder's images.
+    """Return the file names of a folder's images in natural order: 10 after 9.
 
     Raises:
         UserError: The folder has no images.
     """
-    names = sorted(path.name for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    from dopepp.inference.frames.media import sort_paths
+
+    paths = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
+    names = [path.name for path in sort_paths(paths)]
     if not names:
         allowed = f"a folder with {', '.join(SUFFIXES)}"
         fix = "pass the folder that holds the images"

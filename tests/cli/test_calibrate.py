@@ -10,6 +10,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from dopepp.cli.board_images import image_names
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
@@ -142,6 +143,12 @@ def test_a_bench_is_calibrated_from_a_board_on_it(run, refused, cell, tmp_path):
 def test_wrong_options_are_one_line(refused, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     assert message in refused("calibrate", *words)
+
+
+def test_images_are_in_the_order_of_their_numbers(tmp_path):
+    for name in ("10.png", "9.png"):
+        (tmp_path / name).touch()
+    assert image_names(tmp_path) == ["9.png", "10.png"]
 
 
 def test_images_without_the_board_are_an_error(run, cell, tmp_path):
