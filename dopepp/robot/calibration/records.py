@@ -127,7 +127,11 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
     Raises:
         UserError: As for :func:`read_robot_poses`.
     """
-    return _numbers(_read_csv(path), ("x", "y", "z"), path).reshape(-1, 3) * UNITS[unit]
+    records, axes = _read_csv(path), ("x", "y", "z")
+    if records and not records[0].keys() >= {*axes}:
+        problem = f"{path} with the columns {', '.join(map(str, records[0]))[:200]}"
+        raise UserError(problem, "columns x, y and z", "name the columns in the first line")
+    return _numbers(records, axes, path).reshape(-1, 3) * UNITS[unit]
 
 
 def _read_csv(path: Path) -> list[Record]:
@@ -138,7 +142,7 @@ def _read_csv(path: Path) -> list[Record]:
         allowed = f"a readable CSV file of at most {MAX_BYTES / 1e6:g} MB"
         fix = "pass the path of a CSV file in UTF-8"
         raise UserError(f"{path}: {error!s:.200}", allowed, fix) from error
-    separator = ";" if text.partition("\n")[0].count(";") >= 3 else ","
+    separator = ";" if ";" in text.partition("\n")[0] else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=separator)
     return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
 

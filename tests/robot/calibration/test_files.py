@@ -7,7 +7,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.records import PoseFormat, match_images, read_robot_poses
+from dopepp.robot.calibration.records import PoseFormat, match_images, read_points, read_robot_poses
 
 ROTATION = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 POSITION = [0.4, -0.1, 0.3]
@@ -83,3 +83,12 @@ def test_poses_are_paired_with_their_images(tmp_path):
     assert match_images(read_robot_poses(path), ["a.png"]) == {"a.png": 0}
     with pytest.raises(UserError, match="1 poses and 2 images"):
         match_images(read_robot_poses(path), ["a.png", "b.png"])
+
+
+def test_touched_points_need_named_columns_of_any_separator(tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text("x;y;z\n1;2;3\n")
+    assert np.allclose(read_points(path, "mm"), [[0.001, 0.002, 0.003]])
+    path.write_text("1,2,3\n4,5,6\n")
+    with pytest.raises(UserError, match="the columns 1, 2, 3; allowed: columns x, y and z"):
+        read_points(path, "mm")

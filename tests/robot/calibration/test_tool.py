@@ -68,7 +68,11 @@ def test_a_bench_is_estimated_with_its_frame():
 
 @pytest.mark.parametrize(
     ("points", "message"),
-    [(np.zeros((2, 3)), "at least 3"), (np.outer(np.arange(4), [1.0, 2, 0]), "along a line")],
+    [
+        (np.zeros((2, 3)), "at least 3"),
+        (np.outer(np.arange(4), [1.0, 2, 0]), "along a line"),
+        (np.eye(3)[[0, 0, 1, 2]], "next to the first"),
+    ],
 )
 def test_points_that_determine_no_plane_are_rejected(points, message):
     with pytest.raises(UserError, match=message):
