@@ -43,7 +43,7 @@ def along_the_ray(millimetres):
 
 
 def test_view_from_the_side_is_better_than_the_same_view(mesh):
-    views = [beside(0), beside(10), beside(30)]
+    views = np.array([beside(0), beside(10), beside(30)])  # the shape that the page states
     chosen = next_best_view(mesh, POSE, along_the_ray(1.4), views, K, SIZE)
     same, near, far = chosen.expected
     assert chosen.number == 2

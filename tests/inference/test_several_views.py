@@ -251,7 +251,7 @@ def test_views_may_have_different_sizes_and_lenses(estimator, scene, views, true
 
 def test_depth_images_are_used(estimator, scene, views, true):
     images, poses = views
-    depths = [render(scene.seen_from(invert_transform(T))).depth for T in poses[:2]]
+    depths = np.stack([render(scene.seen_from(invert_transform(T))).depth for T in poses[:2]])
     both = estimator.refining(("region", "depth"))
     given = images[:2], [scene.K] * 2, poses[:2]
     without, result = both.predict_views(*given), both.predict_views(*given, depths=depths)

@@ -192,7 +192,7 @@ def _posed_images(
             K, distortion = resized.K, resized.coefficients
         else:
             K, distortion = camera, None
-        depth = depths[number] if depths else None
+        depth = None if depths is None else depths[number]
         image, K, depth = prepare_image(image, K, distortion, depth)
         T = np.asarray(T_world_cam[number], np.float64)
         if not is_rigid(T):

@@ -94,7 +94,7 @@ def next_best_view(
         if added is not None:
             posterior = prior + rotate_covariance(T_world_cam[:3, :3], added)
             expected[-1] = point_error(mesh, T_world_obj, np.linalg.inv(posterior))
-    if not candidates or min(expected) == math.inf:
+    if min(expected, default=math.inf) == math.inf:
         problem = f"no view of {len(candidates)} shows the whole part"
         fix = "pass more camera poses, or poses farther away that look at the part"
         raise UserError(problem, "at least one camera pose that shows the part", fix)
