@@ -27,6 +27,7 @@ from typing import Annotated, Final
 
 import numpy as np
 import trimesh
+import yaml
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
@@ -35,7 +36,7 @@ from dopepp.core.validation import STRICT, Range, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.part import Mesh, Part
+from dopepp.parts.part import MAX_NAME, Mesh, Part
 from dopepp.virtual.body import make_body
 
 MAX_GRASPS: Final = 1000
@@ -164,7 +165,9 @@ def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
         # YAML reads an exponent as text, and −0 becomes 0.
         return ", ".join(f"{round(x, 5) + 0.0:.5f}".rstrip("0").rstrip(".") for x in numbers)
 
-    lines = [f"part: {part.name}", "grasps:"]
+    # A name of digits is quoted.
+    head = yaml.safe_dump({"part": part.name}, allow_unicode=True, width=2 * MAX_NAME)
+    lines = [head.rstrip(), "grasps:"]
     for grasp in grasps:
         names = ("point", "closing", "approach")
         vectors = ", ".join(f"{name}: [{text(getattr(grasp, name))}]" for name in names)

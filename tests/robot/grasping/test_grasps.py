@@ -1,5 +1,7 @@
 """Files of grasps, and proposed grasps: on opposite walls, within the gripper's opening."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -29,6 +31,7 @@ def test_built_in_parts_have_grasps_from_the_front(name):
 def test_written_grasps_are_read(part, tmp_path):
     rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     grasp = Grasp(np.array([0.01, -0.002, -3e-5]), rotation[0], rotation[1], 0.0333)
+    part = replace(part, name="100234 #2")  # neither a number nor a comment
     write_grasps(tmp_path / "g.yaml", part, [grasp])
     (read,) = read_grasps(tmp_path / "g.yaml", part)
     for name in ("point", "closing", "approach", "width"):
