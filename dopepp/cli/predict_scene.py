@@ -53,9 +53,9 @@ def predict_scene(
     from dopepp.inference.several_views.view_files import read_camera_poses
 
     poses = read_camera_poses(views)
-    frames = [frame for source in sources for frame in source.frames()]
-    is_video = any(source.rate is not None for source in sources)
-    if len(frames) < 2 or is_video:
+    is_video = any(source.rate is not None for source in sources)  # a camera never ends
+    frames = [] if is_video else [frame for source in sources for frame in source.frames()]
+    if len(frames) < 2:
         images = f"{len(frames)} image{'s' * (len(frames) != 1)}"
         problem = f"--views with {'a video, a recording or a camera' if is_video else images}"
         raise UserError(problem, "two images or more", "pass the images of one static scene")

@@ -224,6 +224,7 @@ def test_several_views_of_a_scene(run, tmp_path):
     done = run("predict", RELEASED, *images, "--views", path)
     assert done.stdout == ""
     assert "a camera pose is wrong" in done.stderr
-    assert "two images" in run("predict", RELEASED, images[0], "--views", path, code=2).stderr
+    for source, problem in ((images[0], "1 image;"), ("97", "a recording or a camera;")):
+        assert problem in run("predict", RELEASED, source, "--views", path, code=2).stderr
     path.write_text(json.dumps({"views": views}))
     assert "--camera" in run("predict", RELEASED, *images, "--views", path, code=2).stderr
