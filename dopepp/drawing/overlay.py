@@ -7,6 +7,7 @@ because the fonts of cv2 are limited to ASCII.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,6 +20,9 @@ from jaxtyping import Float, UInt8
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
+
+# On first use, matplotlib reports its list of fonts.
+logging.getLogger("matplotlib.font_manager").setLevel(logging.WARNING)
 
 Colour = tuple[int, int, int]  # Red, green and blue, 0 to 255
 
