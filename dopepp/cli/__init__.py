@@ -52,6 +52,8 @@ class _OneLineErrors(TyperGroup):
             return super().invoke(ctx)
         except _UsageError as error:
             line = " ".join(error.format_message().split())  # type: ignore[attr-defined]
+            if not line:  # the help was printed instead
+                raise
             line, code = f"{line.rstrip('.')}; see --help", UserError.exit_code
         except (UserError, RunError, Interruption) as error:
             line, code = str(error), error.exit_code

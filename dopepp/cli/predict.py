@@ -92,7 +92,11 @@ def predict(
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
         from dopepp.inference.frames.source import choose_camera, given_camera
+        from dopepp.parts.mesh.read import READERS
 
+        if meshes := [word for word in source if Path(word).suffix.lower() in READERS]:
+            fix = "run the command for each part, or train a network for all parts"
+            raise UserError(f"the mesh {meshes[0]} as a source", "one mesh, as the model", fix)
         terms = () if refine is None else tuple(refine.split(","))
         if ("depth" in terms) != (depth is not None):
             raise UserError(
@@ -126,10 +130,10 @@ def predict(
             model, device, unit, working_distance, tilt, parts, max_ms, scale_error
         ).reporting(conf)
         known_parts = estimator.parts
-        if verify or "region" in terms:
+        if parts or verify or "region" in terms:
             known_parts = with_meshes(known_parts, parts or (), unit)
-        if terms:
-            estimator = estimator.refining(terms, known_parts)
+        if parts or terms:
+            estimator = estimator.refining(terms or None, known_parts)
         gc.enable()
         if views is not None:
             lens = given_camera(K, camera)

@@ -51,7 +51,7 @@ def test_predict_verifies_and_refines(run, checkpoint, image_file, tmp_path):
         (["--refine", "icp"], "refine=('icp',)"),
         (["--refine", "region,"], "refine=('region', '')"),
         (["--track", "--verify"], "--track with --verify"),
-        (["--verify", "--part", "x=servoholder"], "not in the checkpoint"),
+        (["--part", "x=servoholder"], "not in the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],
 )
@@ -196,6 +196,12 @@ def test_a_wrong_render_option_is_one_line_and_code_2(refused, arguments, messag
 )
 def test_a_wrong_command_is_one_line_and_code_2(refused, arguments, message):
     assert refused(*arguments).startswith(message)
+
+
+def test_a_group_without_a_command_shows_its_help_only(run):
+    done = run("calibrate", code=2)
+    assert "handeye" in done.stdout
+    assert not done.stderr
 
 
 def test_download_prints_the_folder_of_the_photos(run, tmp_path, monkeypatch):

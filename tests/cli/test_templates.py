@@ -103,6 +103,7 @@ def test_wrong_options_are_one_line(refused, truth, intrinsics, command, words, 
 def test_wrong_options_of_single_commands_are_one_line(refused, truth):
     for words, message in (
         (("predict", *MESH, "--part", "piv.stl"), "got --part with the mesh piv.stl"),
+        (("predict", "piv.stl", *MESH), "got the mesh piv.stl as a source"),
         (("benchmark", "piv.stl", *RANGE), "piv.stl without --image"),
         (
             ("predict", *MESH, "--depth", "d.png", "--refine", "depth"),
