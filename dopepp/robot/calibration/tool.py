@@ -85,7 +85,7 @@ def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
 
     Raises:
         UserError: There are fewer than three points, they almost lie on a line, or the first two
-            points are less than 20 mm apart.
+            almost coincide.
     """
     points = np.asarray(touched, np.float64)
     if len(points) < 3:
@@ -96,8 +96,8 @@ def find_bench(touched: Float[np.ndarray, "points 3"]) -> Bench:
     if values[1] < 0.1 * values[0]:
         allowed, fix = "points all over the bench", "touch more points, away from the line"
         raise UserError("points along a line", allowed, fix)
-    if np.linalg.norm(points[1] - points[0]) < 10 * MAX_RESIDUAL:
-        allowed, fix = "20 mm or more, because they define x", "put a farther point second"
+    if np.linalg.norm(points[1] - points[0]) < MAX_RESIDUAL:
+        allowed, fix = "a far point, which defines x", "move a far point to the second line"
         raise UserError("the second point next to the first point", allowed, fix)
     z = axes[2] if axes[2, 2] >= 0 else -axes[2]
     origin = points[0] - (points[0] - centre) @ z * z
