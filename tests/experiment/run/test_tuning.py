@@ -13,21 +13,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.config.run_config import FalsePositiveTarget
-from dopepp.experiment.run.tuning import (
-    MAX_LOST,
+from dopepp.experiment.run.scored_detections import ScoredDetections, matched_poses, score_images
+from dopepp.experiment.run.tuned_factors import (
     MIN_REFINED,
     MIN_REFINED_FACTOR,
-    MIN_REFINED_SCORE,
-    ScoredDetections,
-    TuningCache,
     WrongFocalLengths,
-    choose,
     fit_factors,
     fit_refined_factor,
-    matched_poses,
-    score_images,
-    write_tuned,
 )
+from dopepp.experiment.run.tuning import MAX_LOST, MIN_REFINED_SCORE, choose, write_tuned
+from dopepp.experiment.run.tuning_cache import TuningCache
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
@@ -291,12 +286,6 @@ def test_refined_poses_far_below_even_odds_are_not_reported(caplog):
     # If all poses are correct, the weights stay at their defaults.
     same = choose(replace(shown, correct=np.ones(200, bool)), nothing, refined=True)
     assert [same[f"refined_{name}"] for name in ("bias", "score", "verification")] == [0, 0, 1]
-
-
-def test_several_sources_are_scored_together():
-    both = score_images(estimator(found(POSE, 0.9)), [PART], TWO, TWO)
-    assert (both.num_images, both.num_instances) == (4, 2)
-    assert both.image.tolist() == [0, 1, 2, 3]
 
 
 def test_equivalent_poses_of_a_symmetric_part_are_correct():
