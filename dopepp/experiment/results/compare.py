@@ -43,7 +43,12 @@ from dopepp.experiment.results.compared_runs import (
     group,
     with_refined,
 )
-from dopepp.experiment.results.differences import compact_table, comparison_frame, full_table, notes
+from dopepp.experiment.results.differences import (
+    compact_table,
+    comparison_values,
+    full_table,
+    notes,
+)
 from dopepp.experiment.results.frame import header_of, markdown
 from dopepp.experiment.results.pages import write_page
 from dopepp.experiment.results.paper import PaperTable, write_paper_table
@@ -73,18 +78,17 @@ _TOO_WIDE: Final = frozenset({
 })  # fmt: skip
 
 
-def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:
-    """Write the comparison of methods measured together; Δ refers to the method ``baseline``."""
-    entries = [Entry(report.name, [report], [None]) for report in reports]
-    write_comparison(baseline_first(entries, baseline), folder)
+def compare_reports(reports: Sequence[Report], folder: Path) -> None:
+    """Write the comparison of methods measured together; Δ refers to the first method."""
+    write_comparison([Entry(report.name, [report], [None]) for report in reports], folder)
 
 
 def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
     """Print and write the comparison table and accuracy curves; return ``compare.md``'s content."""
-    table = comparison_frame(entries)
+    values = comparison_values(entries)
     means = [report.mean for entry in entries for report in entry.reports]
-    compact = compact_table(table, any(row.num_symmetries > 1 for row in means))
-    sentences, rows = notes(entries, table), full_table(table)
+    compact = compact_table(values, any(row.num_symmetries > 1 for row in means))
+    sentences, rows = notes(entries, values), full_table(values)
     narrow_rows = [{key: row[key] for key in row if key not in _TOO_WIDE} for row in compact]
     display.show_table("comparison", narrow_rows, num_labels=2)
     for sentence in sentences:
@@ -116,12 +120,7 @@ def compare_paths(
 ) -> Path:
     """Compare run folders and return the folder with the comparison.
 
-    Args:
-        paths: Folders of training runs, evaluations and multiruns.
-        out: New folder (default: a folder below ``outputs/compare``).
-        baseline: Method that Δ refers to (default: ``dope``, else the first method).
-        num_pictures: Number of test images on which every model predicts.
-        table: Experiment file in ``conf/experiment``, whose table layout is written in addition.
+    The arguments are those of ``dopepp compare``.
     """
     layout = None if table is None else PaperTable.read(table)
     runs = find_runs(paths)

@@ -1,4 +1,4 @@
-"""Compare methods: build the frame of a comparison with the differences (Δ) to a baseline.
+"""Compare methods: collect their values with the differences (Δ) to a baseline.
 
 To compare a further measure, add the score of an instance to :data:`COMPARED`.
 """
@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
 
 from dopepp.experiment.results.compared_runs import Entry
@@ -22,11 +23,9 @@ from dopepp.experiment.results.frame import (
     WITHIN_NOISE,
     Row,
     Value,
-    make_frame,
     means,
     pivot,
     row_values,
-    values_of,
 )
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.bootstrap import StatisticName, paired_difference
@@ -109,17 +108,17 @@ def _by_seed(entry: Entry) -> list[Report]:
     return [report for _, report in sorted(pairs, key=lambda pair: str(pair[0]))]
 
 
-def comparison_frame(entries: Sequence[Entry]) -> pd.DataFrame:
-    """Build the results table of a comparison: means over seeds, ordered by method and object.
+def comparison_values(entries: Sequence[Entry]) -> list[Value]:
+    """Return the values of a comparison: means over seeds, ordered by method and object.
 
-    The reference rows of the baseline's test set come last. A method without a result has one row,
+    The references of the baseline's test set come last. A method without a result has one value,
     whose object states the reason.
     """
-    return means(make_frame(_values(entries)))
+    return means(_values(entries))
 
 
 def _values(entries: Sequence[Entry]) -> Iterator[Value]:
-    """Yield the values of :func:`comparison_frame`, one per seed, method by method."""
+    """Yield the values of :func:`comparison_values`, one per seed, method by method."""
     baseline = next((entry for entry in entries if entry.reports), None)
     for entry in entries:
         if entry.failure:
@@ -148,25 +147,25 @@ def _baseline_of(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
 
 
 def _cost_values(entry: Entry, name: str) -> Iterator[Value]:
-    """Yield the cost of a method."""
     for measure, value in zip(COST_FORMS, vars(entry.cost).values(), strict=True):
         yield Value(entry.name, name, measure, math.nan if value is None else float(value))
 
 
-def compact_table(table: pd.DataFrame, symmetric: bool = False) -> list[Row]:
+def compact_table(values: Sequence[Value], symmetric: bool = False) -> list[Row]:
     """Return the main measures of a comparison, with ``value ± deviation`` and ``Δ [interval]``."""
     chosen = _HEADLINE | _SYMMETRIC if symmetric else _HEADLINE
-    several = _has_seeds(table)
+    several = _has_seeds(values)
 
     def cells(value: Value) -> Row:
         return _labels(value, several) | ({value.heading: value.summary} if value.measure else {})
 
-    return pivot(values_of(table[table["measure"].isin(chosen)]), ("method", "object"), cells)
+    shown = (value for value in values if value.measure in chosen)
+    return pivot(shown, ("method", "object"), cells)
 
 
-def full_table(table: pd.DataFrame) -> list[Row]:
+def full_table(values: Sequence[Value]) -> list[Row]:
     """Return a table with a cell per measure, deviation, Δ, interval end, and verdict on noise."""
-    several = _has_seeds(table)
+    several = _has_seeds(values)
 
     def cells(value: Value) -> Row:
         row, title = _labels(value, True), value.heading
@@ -180,7 +179,7 @@ def full_table(table: pd.DataFrame) -> list[Row]:
             row[f"± {title}"] = value.spread
         return row
 
-    return pivot(values_of(table), ("method", "object"), cells)
+    return pivot(values, ("method", "object"), cells)
 
 
 def _labels(value: Value, with_seeds: bool) -> Row:
@@ -190,18 +189,17 @@ def _labels(value: Value, with_seeds: bool) -> Row:
     return {**value.names, "seeds": ", ".join(map(str, value.seeds))}
 
 
-def _has_seeds(table: pd.DataFrame) -> bool:
-    """Return whether any method was trained with several seeds."""
-    return any(len(seeds) > 1 for seeds in table["seeds"])
+def _has_seeds(values: Sequence[Value]) -> bool:
+    return any(len(value.seeds) > 1 for value in values)
 
 
-def notes(entries: Sequence[Entry], table: pd.DataFrame) -> list[str]:
+def notes(entries: Sequence[Entry], values: Sequence[Value]) -> list[str]:
     """Return sentences that explain the table: baseline, intervals, noise and narrowed networks."""
     sentences: list[str] = []
     measured = [entry for entry in entries if entry.reports]
     networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
-        sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(table))
+        sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(values))
     if len(measured) > len(networks) > 1:
         sentences.append(REFINED_NOTE)
     models = [run.config.get("model") for entry in entries for run in entry.runs]
@@ -250,19 +248,17 @@ def _interval_note(baseline: Entry, alike: Sequence[Entry]) -> str:
     return f"{sentence} and over the seeds of the trainings."
 
 
-def noise_notes(table: pd.DataFrame) -> list[str]:
+def noise_notes(values: Sequence[Value]) -> list[str]:
     """Return sentences with the measures, by method and object, whose Δ is not significant."""
-    changes = table[table["num_differing"].notna()]
-    several = changes["object"].nunique() > 1
+    several = len({value.object for value in values if not math.isnan(value.num_differing)}) > 1
+    changes = [value for value in values if value.is_change and not math.isnan(value.value)]
     sentences = []
-    existing = changes[changes["value"].notna()]
-    for (method, name), rows in existing.groupby(["method", "object"], sort=False):
-        unsure = [value for value in values_of(rows) if value.within_noise]
-        if unsure:
+    for (method, name), group in groupby(changes, attrgetter("method", "object")):
+        if unsure := [value for value in group if value.within_noise]:
             subject = f"{method} on {name}" if several else method
             measures = (f"{value.column.heading}{_needed(value)}" for value in unsure)
             sentences.append(f"Within noise, {subject}: {', '.join(measures)}.")
-    if (existing["num_differing"] < MIN_DIFFERING).any():
+    if any(value.num_differing < MIN_DIFFERING for value in changes):
         sentence = f"If methods differ on fewer than {MIN_DIFFERING} instances"
         sentences.append(f"{sentence}, the difference counts as noise.")
     return sentences

@@ -1,7 +1,7 @@
-"""The results frame: one long pandas table of all measured values; other tables are views of it.
+"""Measured values, of which all tables are views.
 
-A row of the frame is a :class:`Value`. :func:`means` averages the frame over seeds, and
-:func:`pivot` arranges the values as a table, which :func:`markdown`,
+:func:`means` averages a list of :class:`Value` over seeds, and :func:`pivot` arranges the values as
+a table, which :func:`markdown`,
 :func:`~dopepp.core.files.write_csv` or :func:`~dopepp.experiment.results.display.show_table` write.
 The module also defines the pass rates that all protocols report (:class:`PassRate`).
 """
@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -43,7 +43,7 @@ Cell = TypeVar("Cell")
 
 
 class Value(NamedTuple):
-    """A measured value, a row of the results table; missing numbers are NaN."""
+    """A measured value; missing numbers are NaN."""
 
     method: str  # or a reference
     object: str  # name of the part, `mean`, or the reason for a missing result
@@ -128,24 +128,8 @@ class Value(NamedTuple):
         return self.column.format(None if math.isnan(value) else value, signed=self.is_change)
 
 
-def make_frame(values: Iterable[Value]) -> pd.DataFrame:
-    """Build a results table with a row per value, in their order."""
-    return pd.DataFrame(list(values), columns=Value._fields).astype({"seed": "Int64"})
-
-
-def values_of(frame: pd.DataFrame, **wanted: object) -> list[Value]:
-    """Return the rows of a results table whose columns have the ``wanted`` values."""
-    chosen = np.ones(len(frame), bool)
-    for name, value in wanted.items():
-        chosen &= (frame[name] == value).to_numpy(bool)
-    return [Value(*row) for row in frame[chosen].itertuples(index=False)]
-
-
 def row_values(
-    row: PoseRow,
-    fields: Iterable[str] = FIELDS,
-    rates: Sequence[str] = (),
-    condition: float = 0.0,
+    row: PoseRow, fields: Iterable[str] = FIELDS, rates: Sequence[str] = (), condition: float = 0.0
 ) -> Iterator[Value]:
     """Yield the values of ``fields`` of a row; those in ``rates`` have a 95 % interval."""
     for field in fields:
@@ -161,18 +145,26 @@ def interval(rate: float, num: int) -> tuple[float, float]:
     return wilson_interval(round(rate * num), num) if exists else (math.nan, math.nan)
 
 
-def means(frame: pd.DataFrame) -> pd.DataFrame:
-    """Average a results table over seeds: one row per method, object, measure and condition.
+def means(values: Iterable[Value]) -> list[Value]:
+    """Average values over seeds: one value per method, object, measure and condition.
 
     The mean is NaN if the value of any seed is missing; a mean over the others would be biased.
     """
-    groups = frame.groupby(["method", "object", "measure", "condition"], sort=False)
-    complete = groups["value"].count() == groups.size()
-    table = groups.first()
-    table["value"] = groups["value"].mean().where(complete)
-    table["deviation"] = groups["value"].std().where(complete)
-    table["seeds"] = groups["seed"].agg(lambda seeds: tuple(sorted(seeds.dropna())))
-    return table.reset_index()[list(Value._fields)]
+    groups: dict[tuple[object, ...], list[Value]] = {}
+    for value in values:
+        key = (value.method, value.object, value.measure, value.condition)
+        groups.setdefault(key, []).append(value)
+    averages = []
+    for group in groups.values():
+        numbers = [value.value for value in group]
+        averages.append(
+            group[0]._replace(
+                value=fmean(numbers),
+                deviation=float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan,
+                seeds=tuple(sorted(value.seed for value in group if value.seed is not None)),
+            )
+        )
+    return averages
 
 
 def pivot(

@@ -27,7 +27,7 @@ from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SHADING
 from dopepp.experiment.results.cost import COST_FILE, FRAMES_FILE, NOTE, save_frame_rates
-from dopepp.experiment.results.differences import REFINED_NOTE, comparison_frame, noise_notes
+from dopepp.experiment.results.differences import REFINED_NOTE, comparison_values, noise_notes
 from dopepp.experiment.results.folder import read_json
 from dopepp.experiment.results.frame import (
     ADD_5CM,
@@ -41,7 +41,6 @@ from dopepp.experiment.results.frame import (
     markdown,
     rate_curves,
     row_values,
-    values_of,
 )
 from dopepp.experiment.results.pages import write_page
 from dopepp.metrics.pose import MEAN
@@ -173,9 +172,9 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
 
     The reference rows come last.
     """
-    table = comparison_frame([replace(entry, name=label) for label, entry in methods.items()])
+    values = comparison_values([replace(entry, name=label) for label, entry in methods.items()])
     texts: dict[tuple[str, str], Row] = {}
-    for value in values_of(table):
+    for value in values:
         texts.setdefault((value.method, value.object), {})[value.measure] = value.summary
     measured = [entry for entry in methods.values() if entry.reports]
     objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
@@ -205,7 +204,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
                 row = by_object[name]
                 cells = {value.measure: value.text for value in row_values(row)}
                 rows.append(_pose_row(layout, row.method, name, cells, {}))
-    return rows, noise_notes(table)
+    return rows, noise_notes(values)
 
 
 def _pose_row(
@@ -225,7 +224,6 @@ def _pose_row(
 
 
 def _number(value: float | None) -> str:
-    """Return a number with thousands separators, or an empty string for None."""
     return "" if value is None else f"{value:,}"
 
 
@@ -310,7 +308,6 @@ def _by_share(points: pd.DataFrame, text: Callable[[pd.Series[float]], str]) -> 
 
 
 def _mean(rates: pd.Series[float]) -> str:
-    """Return mean ± standard deviation as text; the mean alone for a single seed."""
     return f"{rates.mean():.1f}" + (f" ± {rates.std():.1f}" if len(rates) > 1 else "")
 
 

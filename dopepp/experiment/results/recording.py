@@ -62,27 +62,17 @@ def measure_and_record(
     """Measure methods on a test set; print and write tables, curves and images.
 
     ``metrics.json`` describes the last estimator, with its refined poses under ``refined``, or the
-    file of poses if there is no estimator.
+    file of poses if there is no estimator. ``details`` are further values of this file.
 
-    Args:
-        estimators: Estimators by name, the baseline first.
-        parts: Objects to score, as defined by the test data.
-        data: Config of the test data.
-        run_dir: Folder for the results.
-        num_pictures: Number of test images to draw.
-        details: Further JSON values for ``metrics.json``, by key.
-        results: BOP challenge CSVs of other methods, by name.
-        bop_csv: Whether to write the poses of each method.
-        all_measures: Whether to print symmetric measures of objects without symmetries.
-        protocols: Further measurements, such as shading.
-        refine: Refinement to measure in addition, for every estimator.
-        without_parts: Images without the parts, on which detections are counted.
+    The ``estimators`` are sorted, the baseline first, and measured with ``refine`` in addition.
+    ``results`` are BOP challenge CSVs of other methods. Detections on ``without_parts``, images
+    without the parts, are counted.
 
     Returns:
         A report per estimator, then per file.
     """
     protocols = protocols or Protocols()
-    source = held_out_source(data, parts, "test")
+    source: SampleSource = held_out_source(data, parts, "test")
     numbers = object_numbers(data, parts)
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
     methods: dict[str, Method] = {}
@@ -135,7 +125,7 @@ def measure_and_record(
         _write_results(run_dir, measured.poses, data, numbers)
     _draw(run_dir, measured, len(source))
     if len(measured.reports) > 1:
-        compare_reports(measured.reports, run_dir, baseline=measured.reports[0].name)
+        compare_reports(measured.reports, run_dir)
     rates = reported_rates(data, parts)
     for quantity in protocols.by:
         record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
@@ -250,7 +240,6 @@ def _write_results(
     data: DataConfig,
     numbers: Mapping[str, int],
 ) -> None:
-    """Write the poses of every method as BOP challenge CSVs."""
     dataset, split = data.name, "test"
     if data.root is not None and not data.is_rendered("test"):
         dataset, split = data.root.resolve().name, data.image_set("test")

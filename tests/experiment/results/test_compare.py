@@ -25,7 +25,7 @@ from dopepp.experiment.results.compared_runs import Entry, find_runs, group, rea
 from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.differences import (
     compact_table,
-    comparison_frame,
+    comparison_values,
     differences,
     full_table,
 )
@@ -81,17 +81,18 @@ def test_an_interval_of_shares_ends_at_one(entry):
 def test_other_objects_and_objects_without_instances_have_no_difference(entry):
     base = entry("dope", {"bolt": BAD, "nut": BAD})
     method = entry("x", {"bolt": GOOD, "nut": GOOD, "cap": GOOD})
-    table = comparison_frame([base, method])
-    changes = table[(table["method"] == "x") & table["num_differing"].notna()]
-    assert set(changes["object"]) == {"bolt", "nut"}
-    assert set(table[table["method"] == "dope"]["object"]) == {"bolt", "nut", MEAN}
+    values = comparison_values([base, method])
+    changes = [value for value in values if value.method == "x" and value.num_differing >= 0]
+    assert {value.object for value in changes} == {"bolt", "nut"}
+    objects = {value.object for value in values if value.method == "dope"}
+    assert objects == {"bolt", "nut", MEAN}
     empty = entry("dope", BAD)
     empty.reports[0].errors["part"] = np.zeros(0)
     assert all(np.isnan(value.value) for value in differences(empty, empty, "part").values())
 
 
 def test_a_measure_missing_for_one_seed_is_not_available(entry):
-    (row, *_) = full_table(comparison_frame([entry("x", [np.inf] * 32, GOOD)]))
+    (row, *_) = full_table(comparison_values([entry("x", [np.inf] * 32, GOOD)]))
     assert (row["rotation °"], row["± rotation °"]) == ("n/a", "n/a")
 
 
@@ -100,7 +101,7 @@ def test_a_measure_missing_for_one_seed_is_not_available(entry):
 
 def test_refined_poses_follow_their_network(entry):
     def changes(*methods):
-        rows = full_table(comparison_frame(with_refined(list(methods))))
+        rows = full_table(comparison_values(with_refined(list(methods))))
         return [(row["method"], row["Δ ADD-0.1d %"]) for row in rows if row["method"] in names]
 
     dope = Entry("dope", [report_of("dope", BAD, refined=GOOD)], [0])
@@ -172,7 +173,7 @@ def test_methods_have_unique_names_of_differing_overrides(tmp_path):
     folders = [write_run(tmp_path / place / "run", ["model=dope"], "gone") for place in "ab"]
     entries = group(find_runs(folders))
     assert [entry.name for entry in entries] == [f"dope run {folder}" for folder in folders]
-    assert len(compact_table(comparison_frame(entries))) == 2
+    assert len(compact_table(comparison_values(entries))) == 2
 
 
 def test_evaluations_are_grouped_by_the_training_of_a_checkpoint(tmp_path):
@@ -286,7 +287,7 @@ def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch):
         compare_runs([read_run(run)], tmp_path / "new", baseline="x")
     # A given baseline comes before DOPE.
     reports = [report_of("dopepp", GOOD), report_of("dope", BAD)]
-    compare_reports(reports, tmp_path, "dopepp")
+    compare_reports(reports, tmp_path)
     assert [row["method"] for row in read_csv(tmp_path / "compare.csv")][:2] == ["dopepp", "dope"]
     with (tmp_path / "compare_auc.csv").open() as stream:
         assert stream.readline().strip() == "threshold_m,dopepp,dope"
