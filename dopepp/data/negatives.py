@@ -8,14 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dopepp.data.sample import (
-    DescribedSource,
-    Purpose,
-    Sample,
-    SourceInfo,
-    WrappedSource,
-    item_rng,
-)
+from dopepp.data.sample import Purpose, Sample, SampleSource, item_rng
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.virtual.backgrounds import PhotoBackgrounds
@@ -58,37 +51,14 @@ class PhotoFrames:
         key = f"{path.relative_to(self.images.folder).as_posix()}/{round_number}"
         return Sample(image, self.K.copy(), [], None, self.name, key)
 
-    def contains(self, label: str) -> bool:
-        """Return False: the photos show no object to learn."""
-        return False
-
-    def describe(self) -> list[SourceInfo]:
-        """Return one entry: the photos, K, the frames' size and the seed."""
-        identity = {
-            "pictures": self.images.identity(),
-            "K": self.K.tolist(),
-            "size": list(self.size),
-            "seed": self._seed,
-        }
-        return [SourceInfo(self.name, self._length, identity)]
-
-
-class UnlabelledRenders(WrappedSource):
-    """Rendered frames without labels, as their objects must not be detected."""
-
-    def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Return frame ``index`` without instances and depth."""
-        return replace(self._source.sample(index, epoch), instances=[], depth=None)
-
-    def contains(self, label: str) -> bool:
-        """Return False: no object is labelled."""
-        return False
-
 
 class FrameMix:
-    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n."""
+    """Mix of n sources: frame i is frame ⌊i / n⌋ of source i mod n, without labels and depth.
 
-    def __init__(self, sources: Sequence[DescribedSource], num_frames: int) -> None:
+    The objects of rendered frames must not be detected either.
+    """
+
+    def __init__(self, sources: Sequence[SampleSource], num_frames: int) -> None:
         self.sources, self.name, self._length = tuple(sources), "negatives", num_frames
 
     def __len__(self) -> int:
@@ -97,12 +67,4 @@ class FrameMix:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return frame ``index``."""
         item, source = divmod(index, len(self.sources))
-        return self.sources[source].sample(item, epoch)
-
-    def contains(self, label: str) -> bool:
-        """Return whether any source can show the object named ``label``."""
-        return any(source.contains(label) for source in self.sources)
-
-    def describe(self) -> list[SourceInfo]:
-        """Return the descriptions of all sources."""
-        return [info for source in self.sources for info in source.describe()]
+        return replace(self.sources[source].sample(item, epoch), instances=[], depth=None)

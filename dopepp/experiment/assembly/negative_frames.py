@@ -13,9 +13,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from dopepp.data.negatives import FrameMix, PhotoFrames, UnlabelledRenders
+from dopepp.data.negatives import FrameMix, PhotoFrames
 from dopepp.data.rendered import RenderedSource
-from dopepp.data.sample import DescribedSource
+from dopepp.data.sample import SampleSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
 from dopepp.experiment.assembly.photos import held_out_photos, negative_photos
@@ -55,14 +55,8 @@ _NUM_POSES: Final = 64  # number of sampled poses per part for measuring the pre
 
 def negative_frames(
     data: DataConfig, parts: Parts, split: Literal["val", "test"], num_images: int
-) -> DescribedSource:
-    """Build frames of a held-out split that show none of the parts.
-
-    Args:
-        data: Options of the data; its backgrounds provide the photos.
-        parts: Parts with meshes.
-        split: ``val`` to choose a threshold, ``test`` to check it.
-        num_images: Number of frames.
+) -> SampleSource:
+    """Build frames of a held-out split that show none of the parts, which have meshes.
 
     Raises:
         UserError: A folder of photos has too few photos to be divided.
@@ -82,9 +76,6 @@ def negative_frames(
     def whole(images: PhotoBackgrounds, kind: str) -> PhotoFrames:
         return PhotoFrames(images, view.K, view.size, share, kind, data.eval_seed)
 
-    def rendered(factory: Factory, kind: str) -> UnlabelledRenders:
-        return UnlabelledRenders(RenderedSource(factory, share, split, kind))
-
     empty = replace(preset, targets_per_image=(0, 0))
     bare = replace(
         preset,
@@ -97,10 +88,10 @@ def negative_frames(
     # Frames always use the fast renderer.
     scenes = Factory(parts, empty, data.eval_seed, behind, negatives=build_negatives(data, parts))
     similar = Factory(lookalikes(parts), bare, data.eval_seed, photos)
-    sources: list[DescribedSource] = [
+    sources: list[SampleSource] = [
         whole(photos, PHOTOS),
-        rendered(scenes, SCENES),
-        rendered(similar, LOOKALIKES),
+        RenderedSource(scenes, share, split, SCENES),
+        RenderedSource(similar, share, split, LOOKALIKES),
     ]
     if user_photos is not None:
         sources.append(whole(user_photos, OWN))

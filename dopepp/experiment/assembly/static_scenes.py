@@ -10,7 +10,7 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.bop_reader import BopReader
-from dopepp.data.sample import DescribedSource, Sample, SourceInfo
+from dopepp.data.sample import Sample, SampleSource
 from dopepp.geometry.camera import Transform
 from dopepp.inference.several_views.view_files import CameraPoses, read_camera_poses
 
@@ -60,16 +60,8 @@ class StaticScenes:
             chosen.append(left.pop(int(np.abs(angles - ANGLE_DEG).argmin())))
         return chosen[1:]
 
-    def contains(self, label: str) -> bool:
-        """Return whether any image shows this object."""
-        return self._reader.contains(label)
 
-    def describe(self) -> list[SourceInfo]:
-        """Return the description of the reader's images."""
-        return self._reader.describe()
-
-
-def with_views(source: DescribedSource, num_views: int) -> DescribedSource:
+def with_views(source: SampleSource, num_views: int) -> SampleSource:
     """Return test images with further images of their scenes."""
     if isinstance(source, BopReader):
         return StaticScenes(source, num_views)

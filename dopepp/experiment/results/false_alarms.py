@@ -13,7 +13,7 @@ from typing import Final
 from dopepp.data.negatives import PhotoFrames
 from dopepp.data.sample import Sample, SampleSource
 from dopepp.drawing.overlay import YELLOW, Wireframe, overlay
-from dopepp.drawing.pictures import read_picture
+from dopepp.drawing.pictures import Size, read_picture
 from dopepp.drawing.sheet import Tile
 from dopepp.experiment.assembly.negative_frames import frame_view
 from dopepp.experiment.config.data_config import DataConfig
@@ -53,22 +53,18 @@ class FalseAlarms:
         }
 
 
-@dataclass
-class UndistortedFrames:
+class UndistortedFrames(PhotoFrames):
     """Images of a camera, without its lens distortion."""
 
-    frames: PhotoFrames
-    camera: Camera
-    name: str = TITLE
-
-    def __len__(self) -> int:
-        return len(self.frames)
+    def __init__(self, images: PhotoBackgrounds, camera: Camera, size: Size) -> None:
+        super().__init__(images, camera.K, size)
+        self._camera = camera
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Return an undistorted image without instances, with the path of its file as key."""
-        sample = self.frames.sample(index, epoch)
+        sample = super().sample(index, epoch)
         key = sample.key.rpartition("/")[0]
-        return replace(sample, image=self.camera.undistorted(sample.image), key=key)
+        return replace(sample, image=self._camera.undistorted(sample.image), key=key)
 
 
 def frames_without_parts(
@@ -88,7 +84,7 @@ def frames_without_parts(
     if size is None:
         height, width = read_picture(images.paths[0]).shape[:2]
         size = (width, height)
-    return UndistortedFrames(PhotoFrames(images, lens.K, size), lens)
+    return UndistortedFrames(images, lens, size)
 
 
 def count_false_alarms(
@@ -117,7 +113,6 @@ def count_false_alarms(
 
 
 def _tile(estimator: PoseEstimator, sample: Sample) -> Tile:
-    """Draw the candidate with the highest score on an image without the part."""
     best = estimator.candidates(sample.image, sample.K, cropped=True)[0]
     wireframe = Wireframe(best.keypoints, YELLOW, f"{best.object} {best.score:.3g}")
     return Tile(overlay(sample.image, [wireframe]), sample.key)
