@@ -30,8 +30,7 @@ def build_parts(data: DataConfig) -> list[Part]:
 
     With a camera, a part with ``data.symmetries=auto`` may differ from its rotated copy by a pixel.
     """
-    # Without a camera, the camera of a BOP data set is set later (``fit_to_camera``).
-    view = None if data.virtual.camera is None else data.virtual.view
+    view = data.virtual.view
     resolution = 0.0 if view is None else view.resolution
     return choose_symmetries(_read_parts(data), data.symmetries, resolution)
 

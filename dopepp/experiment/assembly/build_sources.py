@@ -230,8 +230,8 @@ def fit_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     """
     config = _with_camera_of_images(config, parts)
     data, virtual = config.data, config.data.virtual
-    view = virtual.view
-    if view is None:
+    virtual.check_view()
+    if (view := virtual.view) is None:
         return config
     scale = virtual.camera_scale or view.scale_for(parts, data.input_size)
     view.check(parts, scale)

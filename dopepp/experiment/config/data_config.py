@@ -27,8 +27,6 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 16384)]
 
-MAX_WORKERS: Final = 1024  # maximum number of loader processes
-
 _MULTIPLE: Final = 32  # both sides of the network's input are multiples of this number of pixels
 
 # Nodes to which an evaluation cannot add options.
@@ -99,17 +97,20 @@ class VirtualConfig:
 
     @property
     def view(self) -> View | None:
-        """Camera with its working distance; None if the preset's camera is used."""
-        if self.camera is None and self.working_distance is None:
+        """Camera with its working distance; None unless both are known."""
+        lens = self.camera
+        if lens is None or self.working_distance is None:
             return None
-        if self.camera is None or self.working_distance is None:
+        K = camera_matrix(lens.fx, lens.fy, lens.cx, lens.cy)
+        return View((lens.width, lens.height), K, self.working_distance)
+
+    def check_view(self) -> None:
+        """Raise a UserError for a camera without a working distance, or the reverse."""
+        if (self.camera is None) != (self.working_distance is None):
             missing = "camera=FILE" if self.camera is None else "working_distance=[0.3,0.8]"
             given = "working_distance" if self.camera is None else "camera"
             allowed = "camera and working_distance together, or neither"
             raise UserError(f"{given} without {missing}", allowed, f"add {missing}")
-        lens = self.camera
-        K = camera_matrix(lens.fx, lens.fy, lens.cx, lens.cy)
-        return View((lens.width, lens.height), K, self.working_distance)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,6 +287,7 @@ def evaluation_data(
             return chosen
         chosen = replace(chosen, virtual=_chosen_virtual(virtual or {}, how, source))
         _ = chosen.preset
+        chosen.virtual.check_view()
         return chosen
     except UserError as error:
         if whole or error.got.startswith(source):
