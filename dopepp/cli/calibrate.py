@@ -310,7 +310,6 @@ def _bench_from_board(
 
 
 def _show_lens(calibration: LensCalibration) -> None:
-    """Print reprojection errors, image cells with points, and intrinsics ± standard deviations."""
     for name, error in zip(calibration.names, calibration.errors_px, strict=True):
         typer.echo(f"{name}: {error:.3f} px")
     for name in calibration.outliers:
@@ -328,7 +327,6 @@ def _show_lens(calibration: LensCalibration) -> None:
 def _show_hand_eye(
     boards: Sequence[BoardPose], calibration: HandEye, quality: CalibrationQuality
 ) -> None:
-    """Print the errors of each pose and of the robot, expected errors, and advice on more poses."""
     from math import degrees
 
     for number, board in enumerate(boards):
@@ -350,7 +348,6 @@ def _show_hand_eye(
 
 
 def _show_rig(calibration: Rig) -> None:
-    """Print rejected images, and each camera's reprojection error and pose standard deviations."""
     from math import degrees, hypot
 
     for moment in calibration.outliers:

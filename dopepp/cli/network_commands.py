@@ -68,7 +68,6 @@ def benchmark(
 
 
 def _row(path: Path, timing: Timing) -> dict[str, str]:
-    """Return a model's row of the benchmark table, in milliseconds, by column name."""
     import numpy as np
 
     p50, p95 = np.percentile(timing.frame, (50, 95))

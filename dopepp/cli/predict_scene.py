@@ -36,14 +36,8 @@ def predict_scene(
 ) -> None:
     """Estimate the poses of parts from all images of a static scene; print and write the poses.
 
-    Args:
-        estimator: Estimator that refines by region.
-        sources: Images of the scene.
-        views: File of the camera poses.
-        camera: Intrinsics of the images for which ``views`` names no camera file.
-        distances: Nearest and farthest depth of the parts, metres, or ``any``.
-        save: Folder for images with drawn poses.
-        json_file: File for a line of JSON.
+    The estimator refines by region. ``camera`` is that of images for which ``views``, the file of
+    the camera poses, names no camera file.
 
     Raises:
         UserError: There are fewer than two images, a source is not a still image, or an image

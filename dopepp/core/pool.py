@@ -347,7 +347,6 @@ class ClusterPool(Pool):
 
 
 def _connect(address: str | None, num_workers: int, asked_by: str, option: str) -> Any:
-    """Import Ray, and connect to a cluster or start one on this machine."""
     require("ray", asked_by, "ray")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # before the import, because Ray reads it then
     import ray

@@ -29,7 +29,7 @@ class Batch:
         T_cam_obj: Rigid transforms, metres; the identity in padding.
         keypoints: Projected cuboids in pixels; NaN behind the camera and in padding.
         object_index: Index of the instance's object among the network's objects, −1 in padding.
-        visible_fraction: See ``Instance``; 0 in padding, like ``masked_fraction``.
+        visible_fraction: See ``Instance``; 0 in padding.
     """
 
     images: UInt8[Tensor, "batch 3 height width"]
@@ -38,7 +38,6 @@ class Batch:
     keypoints: Float[Tensor, "batch instances 9 2"]
     object_index: Int[Tensor, "batch instances"]
     visible_fraction: Float[Tensor, "batch instances"]
-    masked_fraction: Float[Tensor, "batch instances"]
     keys: list[str]
     sources: list[str]
 
@@ -75,7 +74,6 @@ def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch
         "T_cam_obj": np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1)),
         "keypoints": np.full((*shape, 9, 2), np.nan, np.float32),
         "visible_fraction": np.zeros(shape, np.float32),
-        "masked_fraction": np.zeros(shape, np.float32),
     }
     index = np.full(shape, PADDING, np.int64)
     for row, sample in enumerate(samples):

@@ -27,9 +27,7 @@ NONE: Final = "none"
 
 
 def choose_symmetries(
-    parts: Sequence[Part],
-    choice: str | Mapping[str, object] | None,
-    resolution: float = 0.0,
+    parts: Sequence[Part], choice: str | Mapping[str, object] | None, resolution: float = 0.0
 ) -> list[Part]:
     """Return the parts with the symmetries that ``choice`` names.
 

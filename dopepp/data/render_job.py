@@ -98,20 +98,9 @@ def make_job(
 ) -> RenderJob:
     """Make a job from user input; the arguments are the options of ``dopepp render``.
 
-    Args:
-        parts: Built-in names, mesh files, or ``NAME=FILE`` to name a file's part.
-        unit: Unit of the mesh files; None for the unit of the format, otherwise millimetres.
-        preset: Name of a preset, which defines the random scenes.
-        changes: Changed fields of the preset as ``field.field=value``, the value in YAML.
-        size: ``WIDTHxHEIGHT`` in pixels for :meth:`Preset.reframed`; None for the preset's size.
-        seed: Seed of all random choices of the job.
-        backgrounds: Value for :func:`~dopepp.virtual.backgrounds.find_backgrounds`.
-        negatives: Parts to show as distractors without labels, written like ``parts``.
-        renderer: Name of a renderer, see :mod:`dopepp.virtual.renderers`.
-        layout: Key of :data:`WRITERS`.
-        camera: File of the camera to simulate; None for the preset's camera.
-        working_distance: Nearest and farthest distance of the parts from this camera, metres.
-        views: Number of cameras of each scene. More than 1 gives a folder per scene; BOP only.
+    ``parts`` and ``negatives`` are built-in names, mesh files, or ``NAME=FILE`` to name a file's
+    part. ``changes`` are fields of the preset as ``field.field=value``, the value in YAML. ``size``
+    is ``WIDTHxHEIGHT`` in pixels, and ``layout`` a key of :data:`WRITERS`.
     """
     check_choice("--format", layout, WRITERS)
     check("--views", views, int, Range(1, MAX_VIEWS))

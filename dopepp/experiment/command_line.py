@@ -63,7 +63,6 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
 
 
 def _refuse_used_folder(folder: str) -> None:
-    """Raise an error if the value of ``hydra.run.dir`` already contains a run."""
     from dopepp.experiment.results.folder import VERSIONS_FILE
 
     # Processes of higher rank receive the folder that rank 0 has created.

@@ -39,9 +39,6 @@ _log = logging.getLogger(__name__)
 Job = Callable[[dict[str, Any], Path], object]
 """Function that runs a job, given its resolved config and its run folder."""
 
-FAILED: Final = 1
-USERS_MISTAKE: Final = 2
-
 _REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST)
 """Numbers of ``OSError`` for a full, read-only or inaccessible location; others are bugs."""
 
@@ -69,12 +66,7 @@ _ENTRIES: Final = {
 
 
 def start(name: str, num_words: int = 1) -> None:
-    """Run ``train`` or ``evaluate`` with the arguments of the command line.
-
-    Args:
-        name: ``train`` or ``evaluate``.
-        num_words: Number of words before the overrides: 1 for ``train.py``, 2 for ``dopepp train``.
-    """
+    """Run ``train`` or ``evaluate``; for ``num_words``, see :func:`.command_line.prepare`."""
     task, open_nodes, short_names = _ENTRIES[name]
 
     def main() -> None:
@@ -110,23 +102,23 @@ def entry(
         first = program.is_first_process()
         if interruption.number == signal.SIGTERM and multirun.job_id() is not None and first:
             line = f"{line}; {multirun.requeue()}"
-        _exit(line, interruption.exit_code)
+        _exit(interruption, line)
     except (HydraException, OmegaConfBaseException) as error:  # some HydraExceptions are OSErrors
-        _exit(command_line.convert_error(error), USERS_MISTAKE)
+        _exit(command_line.convert_error(error))
     except OSError as error:  # jobs handle their own errors, so this is an error of Hydra
         if error.errno not in _REFUSALS:
             raise
         allowed, fix = "a folder that can be written", "set output_dir=FOLDER, or make it writable"
         problem = f"output folder {error.filename}: {error.strerror}"
-        _exit(UserError(problem, allowed, fix), USERS_MISTAKE)
+        _exit(UserError(problem, allowed, fix))
     except UserError as error:  # raised by a sweeper or launcher: jobs handle their errors
-        _exit(error, USERS_MISTAKE)
+        _exit(error)
 
 
-def _exit(line: object, code: int) -> None:
+def _exit(error: UserError | RunError | Interruption, line: str = "") -> None:
     sys.stdout.flush()
-    sys.stderr.write(f"{line}\n")
-    raise SystemExit(code)
+    sys.stderr.write(f"{line or error}\n")
+    raise SystemExit(error.exit_code)
 
 
 def run_job(config: DictConfig, job: Job) -> float | None:
@@ -162,15 +154,14 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     except (UserError, OmegaConfBaseException) as error:
         if not resumed and program.is_first_process():
             _remove_unused(run_dir)
-        mistake = error if isinstance(error, UserError) else command_line.convert_error(error)
-        _exit(mistake, USERS_MISTAKE)
+        _exit(error if isinstance(error, UserError) else command_line.convert_error(error))
     except RunError as error:
-        _exit(error, FAILED)
+        _exit(error)
     except OSError as error:
         if error.errno not in _REFUSALS:
             raise
         where = error.filename or run_dir
-        _exit(f"cannot write {where}: {error.strerror}; free or repair it", FAILED)
+        _exit(RunError(f"cannot write {where}: {error.strerror}; free or repair it"))
     return None
 
 
@@ -218,6 +209,5 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """Return the config as nested dictionaries and lists, with interpolations resolved."""
     plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return dict(plain)

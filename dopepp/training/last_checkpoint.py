@@ -192,7 +192,6 @@ class StopRequest:
         self._previous = {}
 
     def _handle(self, number: int, _: FrameType | None) -> None:
-        """Handle a signal: request a stop; on a second Ctrl-C, stop at once."""
         if os.getpid() != self._process:  # a forked worker of the data loader
             return
         if number == signal.SIGINT and self.number is not None:

@@ -120,7 +120,6 @@ class AveragedWeights(WeightAveraging):
 
     @property
     def _averaged(self) -> AveragedModel:
-        """The averaged model, which exists during training."""
         assert self._average_model is not None, "there is no average before fit begins"
         return self._average_model
 

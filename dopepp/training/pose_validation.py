@@ -206,7 +206,6 @@ class BeliefMaps(ValidationSheet):
 
 
 def _log_picture(trainer: Trainer, name: str, image: RGBImage) -> None:
-    """Send an image to every logger that accepts images."""
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger):
             logger.log_picture(name, image, trainer.global_step)

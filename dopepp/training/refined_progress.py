@@ -36,11 +36,9 @@ class RefinedProgress(Callback):
     share of instances whose pose has a score of at least ``MIN_SCORE`` and an ADD(-S) below a tenth
     of the diameter.
 
-    Args:
-        images: Held-out images, at the camera's resolution.
-        refine: Method or methods that refine the poses, e.g. ``region``.
-        stop_at: ``val/refined`` at which the training ends, if confirmed; None: never.
-        every_s: Shortest time between two measurements, which take at most a tenth of the time.
+    The training ends when ``val/refined`` reaches ``stop_at``, if confirmed on further images.
+    ``every_s`` is the shortest time between two measurements, which take at most a tenth of the
+    time.
     """
 
     def __init__(
@@ -104,7 +102,6 @@ class RefinedProgress(Callback):
         return reached
 
     def _estimator(self, system: PoseSystem) -> PoseEstimator:
-        """Return an estimator of the network with its present weights."""
         checkpoint = parse_description(system.payload)
         network = system.network.for_inference()
         estimator = PoseEstimator(network, checkpoint, system.device, self.refine, system.parts)
@@ -126,7 +123,6 @@ class RefinedProgress(Callback):
         return self._minutes_before + (time.monotonic() - self._begin) / 60
 
     def _draw(self, folder: Path) -> None:
-        """Write ``refined.png``, which shows ``val/refined`` over the minutes of training."""
         x, rate, low, high = np.array(self.curve).T
         panels = {"refined and reported poses": {"ADD(-S)-0.1d": RateCurve(x, rate, low, high)}}
         figure = rates_figure(panels, "minutes of training", columns=1)

@@ -228,6 +228,5 @@ def _move_paths(state: Any, folder: Path) -> Any:
 
 
 def _failure(path: Path, error: OSError) -> str:
-    """Describe why a checkpoint could not be written, with advice."""
     advice = _ADVICE.get(error.errno or 0, "repair it")
     return f"cannot save {path.name} in {path.parent}: {error.strerror or error}; {advice}"

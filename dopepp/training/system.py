@@ -59,16 +59,9 @@ class PoseSystem(LightningModule):
     """Trains a network on belief maps and vector fields, and recovers poses from its maps.
 
     Args:
-        network: The network to train.
-        loss: Loss of the network's maps against the target maps.
         parts: The objects, in the order of the network's channels.
-        geometry: Stride, peak width and field radius of the target maps.
-        recovery: Options of the recovery from maps to poses.
-        make_optimizer: Builds the optimiser.
         make_scheduler: Builds a schedule, stepped every batch, from optimiser and number of steps.
         payload: Description of network and data, stored in every checkpoint under ``dopepp``.
-        compile_network: Whether to compile the network with ``torch.compile``.
-        symmetry: Options for symmetric parts.
     """
 
     def __init__(
@@ -215,7 +208,6 @@ def check_state(checkpoint: Mapping[str, Any]) -> None:
 
 
 def _tensors(value: object) -> Iterator[Tensor]:
-    """Yield all tensors in nested mappings and lists."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, (Mapping, list, tuple)):

@@ -162,7 +162,7 @@ def test_wrong_options(build):
 def test_collate_pads_instances(fake_source):
     first, none, two = (fake_source().sample(index) for index in range(3))
     none.instances = []
-    two.instances.append(replace(two.instances[0], label="can", masked_fraction=0.25))
+    two.instances.append(replace(two.instances[0], label="can"))
     batch = collate([first, none, two], {"can": 0, "box": 1})
     assert batch.object_index.tolist() == [[1, PADDING], [PADDING] * 2, [1, 0]]
     assert (batch.images.dtype, batch.images.shape) == (torch.uint8, (3, 3, 48, 64))
@@ -179,7 +179,6 @@ def test_collate_pads_instances(fake_source):
     assert not batch.keypoints[~padding].isnan().any()
     assert (batch.T_cam_obj[padding] == torch.eye(4)).all()
     assert batch.visible_fraction[padding].eq(0).all()
-    assert batch.masked_fraction[2].tolist() == [0.0, 0.25]
     assert (batch.keys, batch.sources) == (["0/0", "0/1", "0/2"], ["fake"] * 3)
     assert len(batch) == 3
 

@@ -46,7 +46,6 @@ def make_batch(poses, part):
         keypoints=torch.from_numpy(keypoints).float()[:, None],
         object_index=torch.zeros(count, 1, dtype=torch.long),
         visible_fraction=torch.ones(count, 1),
-        masked_fraction=torch.zeros(count, 1),
         keys=[str(number) for number in range(count)],
         sources=["test"] * count,
     )

@@ -51,11 +51,8 @@ class ShadedSample:
 def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[ShadedSample]:
     """Return one copy of an image per share, with this share of each object covered by patches.
 
-    Args:
-        sample: The image with its annotated objects.
-        shares: Shares of each instance's visible pixels to cover, in [0, 1], one per result.
-        seed: Seed of the patches, which are crops of the image's background.
-        index: Index of the image in the test set; the patches also depend on it.
+    The patches are crops of the image's background. They depend on ``seed`` and on the image's
+    ``index`` in the test set. ``shares`` refer to each instance's visible pixels.
     """
     shape = sample.image.shape[:2]
     silhouettes = [silhouette(instance, shape) for instance in sample.instances]

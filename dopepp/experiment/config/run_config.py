@@ -114,7 +114,6 @@ class TrainerConfig:
         return max(outside, self.num_nodes * self._num_devices())
 
     def _num_devices(self) -> int:
-        """Return the number of devices per machine that ``trainer.devices`` selects."""
         devices = self.devices
         if isinstance(devices, str) and "," in devices:
             devices = [piece for piece in devices.split(",") if piece.strip()]

@@ -21,14 +21,7 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.config.run_config import QuantityName
 from dopepp.experiment.results import display
-from dopepp.experiment.results.frame import (
-    PassRate,
-    Row,
-    Value,
-    interval,
-    pivot,
-    rate_curves,
-)
+from dopepp.experiment.results.frame import PassRate, Row, Value, interval, pivot, rate_curves
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.metrics.pose import MEAN, EvaluatedInstances, PoseMetrics

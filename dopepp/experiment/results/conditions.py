@@ -315,7 +315,6 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
 
 
 def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
-    """Return the number of instances and their mean visible fraction as text."""
     share = f", {100 * fractions.mean():.0f} % visible on average"
     return f"{len(fractions)}{share}" if len(fractions) else "none"
 

@@ -109,7 +109,6 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
 
 @cache
 def _packages() -> dict[str, str]:
-    """Return the versions of the installed packages by name."""
     headers = (package.metadata for package in distributions())  # parsed at every access
     versions = [(header["Name"], header["Version"]) for header in headers if "Name" in header]
     return dict(sorted(versions, key=lambda version: version[0].lower()))

@@ -230,7 +230,6 @@ def image_id(sample: Sample, index: int) -> ImageId:
 
 
 def _median_ms(seconds: Sequence[float]) -> float | None:
-    """Return the median of times in seconds as milliseconds, or None without times."""
     return 1000 * statistics.median(seconds) if seconds else None
 
 

@@ -61,7 +61,6 @@ def tune_and_record(
 
 
 def _show(tuning: Tuning, path: Path) -> None:
-    """Print the effect of tuning on test images, the tuned options and the new path."""
     shown, empty = tuning.num_images
     rows = [
         {
@@ -199,7 +198,6 @@ def _methods(
 
 
 def _check_combination(options: EvaluationConfig) -> None:
-    """Raise a UserError for the first impossible combination of options."""
     has_network = options.ckpt_path is not None or options.baseline is not None
     templates, both = options.templates is not None, "both options together"
     protocols = options.protocols

@@ -51,14 +51,8 @@ def export(
 ) -> ExportResult:
     """Write the network of a checkpoint as one file (OpenVINO: a folder).
 
-    Args:
-        path: The checkpoint.
-        layout: File format, one of :data:`~dopepp.inference.export.EXPORTERS`.
-        precision: One of :data:`~dopepp.inference.export.PRECISIONS`.
-        out: Path of the export; None for a path next to the checkpoint, or in the working directory
-            for a released checkpoint.
-        num_images: For int8, number of rendered scenes for calibration, and of further scenes on
-            which ADD-0.1d is measured.
+    The arguments are those of ``dopepp export``. A released checkpoint is exported to the working
+    directory by default.
 
     Raises:
         RunError: An fp32 export differs from the checkpoint by more than rounding, another export

@@ -257,6 +257,5 @@ def _image_difference(stored: Mapping[str, Any], present: Mapping[str, Any]) -> 
 
 
 def _shown(value: object) -> str:
-    """Return a value as text, cut after :data:`_LONG` characters."""
     text = str(value)
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"

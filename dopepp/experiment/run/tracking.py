@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -37,15 +37,13 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 """Overrides that are omitted in a run's name, because group, model or data state them."""
 
 
-@contextmanager
-def open_trackers(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
-    """Yield the trackers of ``config.logger``, and close them when the context ends."""
+def open_trackers(config: RunConfig, run_dir: Path) -> AbstractContextManager[list[GuardedLogger]]:
+    """Return a context with the trackers of ``config.logger``, which closes them at its end."""
     chosen = [override for override in overrides_of(run_dir) if not override.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
     begun = _interrupted_id(run_dir) if config.resume is not None else None
-    with _open(config.logger, run_dir, name, group, "train", begun) as trackers:
-        yield trackers
+    return _open(config.logger, run_dir, name, group, "train", begun)
 
 
 @contextmanager

@@ -25,11 +25,7 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
-from dopepp.experiment.assembly.build_system import (
-    build_system,
-    build_trainer,
-    keep_freed_memory,
-)
+from dopepp.experiment.assembly.build_system import build_system, build_trainer, keep_freed_memory
 from dopepp.experiment.assembly.photos import held_out_photos
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
@@ -124,12 +120,8 @@ def run_training(config: RunConfig, run_dir: Path) -> Report:
 
 
 def _train(
-    config: RunConfig,
-    run_dir: Path,
-    readme: pages.RunReadme,
-    trackers: Sequence[GuardedLogger],
+    config: RunConfig, run_dir: Path, readme: pages.RunReadme, trackers: Sequence[GuardedLogger]
 ) -> Report:
-    """Train and measure the best checkpoint; see :func:`run_training`."""
     if not config.keep_checkpoints and config.resume is not None:
         raise UserError(
             f"resume={config.resume} with keep_checkpoints=false",

@@ -33,14 +33,8 @@ from dopepp.experiment.results.folder import FAILURE_FILE, write_json
 _MOST: Final = 1024
 
 _ANYWHERE: Final = (
-    "timeout_min",
-    "nodes",
-    "tasks_per_node",
-    "cpus_per_task",
-    "gpus_per_node",
-    "mem_gb",
-    "name",
-)
+    "timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node", "mem_gb", "name",
+)  # fmt: skip
 """Options that every submitit cluster accepts; other options get the prefix ``slurm_``."""
 
 
@@ -168,11 +162,8 @@ def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
 def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
     """Return a runner that submits a job array and waits for it.
 
-    Args:
-        folder: Folder of SLURM's logs.
-        cluster: ``slurm``, or ``local`` for processes of this machine.
-        max_num_timeout: Maximum number of times that a job is requeued at its time limit.
-        sbatch: Options of sbatch by submitit's names; None uses the default of the cluster.
+    SLURM's logs are written to ``folder``. The cluster is ``slurm``, or ``local`` for processes of
+    this machine. ``sbatch`` has options by submitit's names; None selects the cluster's default.
     """
     require("submitit", "hydra/launcher=submitit_slurm", "slurm")
     given = {key: value for key, value in sbatch.items() if value is not None}

@@ -128,7 +128,6 @@ def redirected_output(path: Path) -> Iterator[None]:
 
 
 def _redirect(targets: list[int]) -> None:
-    """Redirect stdout and stderr to these file descriptors."""
     sys.stdout.flush()
     sys.stderr.flush()
     for target, number in zip(targets, _STANDARD_OUT_AND_ERROR, strict=True):

@@ -151,7 +151,6 @@ class _Trials:
                 self._study.tell(trial.number, value, state=state)
 
     def _running(self) -> list[FrozenTrial]:
-        """Return the study's trials in the state ``RUNNING``."""
         return self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
 
 
@@ -225,7 +224,6 @@ def _distribution(sweep: Override) -> distributions.BaseDistribution:
 
 
 def _bad_entry(problem: str) -> UserError:
-    """Return the error for a wrong entry of the search space, which ``problem`` describes."""
     return UserError(
         f"search.space with {problem}",
         "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",

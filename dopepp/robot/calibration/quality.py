@@ -217,7 +217,6 @@ class CalibrationQuality:
     rotation: float  # expected error of the camera's rotation (1 σ), radians
     leave_one_out: Float[np.ndarray, "poses"]  # motion of the camera without each pose, metres
     diversity: Vector  # RMS rotation over pairs about the 3 principal axes, radians, descending
-    weakest: Vector  # direction of the largest position variance, unit vector in the mount's frame
     next_pose: str  # advice on the rotation that reduces the largest position variance
     findings: tuple[str, ...]  # reasons not to trust the calibration, with remedies
 
@@ -257,7 +256,7 @@ def assess(
         without, _, _ = refine(M[rest], B[rest], B_cov[rest], X, Y, noise)
         changes[index] = np.linalg.norm(without[:3, 3] - X[:3, 3])
     reasons = tuple(text for text, applies in findings.items() if applies)
-    return CalibrationQuality(shift, rotation, changes, diversity, weakest, next_pose, reasons)
+    return CalibrationQuality(shift, rotation, changes, diversity, next_pose, reasons)
 
 
 def expected_error(covariance: Float[np.ndarray, "6 6"], distance: float) -> tuple[float, float]:

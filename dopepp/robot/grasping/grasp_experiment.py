@@ -59,10 +59,7 @@ def parse_sources(text: str) -> tuple[PoseSource, ...]:
 def check_task(task: GraspTask, poses: str, count: int) -> GraspTask:
     """Check the options of an experiment before its trials start, and set its pose sources.
 
-    Args:
-        task: Options from the command line.
-        poses: Comma-separated names of :data:`SOURCES`.
-        count: Number of trials.
+    ``poses`` are comma-separated names of :data:`SOURCES`, ``count`` the number of trials.
 
     Returns:
         The task with its ``sources``; ``network`` is None if no source needs a network.

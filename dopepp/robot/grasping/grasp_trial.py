@@ -44,13 +44,7 @@ from dopepp.robot.grasping.rehearsal import (
 )
 from dopepp.robot.grasping.selection import EstimatedPart, choose_part, choose_viewpoint
 from dopepp.robot.grasping.unexplained import Unexplained, find_unexplained
-from dopepp.robot.grasping.workbench import (
-    Layout,
-    MujocoView,
-    Photographer,
-    PlacedBody,
-    RasterView,
-)
+from dopepp.robot.grasping.workbench import Layout, MujocoView, Photographer, PlacedBody, RasterView
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
@@ -222,7 +216,6 @@ class Trials:
 
     @cached_property
     def _outline(self) -> OutlineMesh:
-        """The part's mesh, prepared for its outline."""
         assert self.part.mesh is not None  # a part without a mesh cannot be simulated
         return make_outline_mesh(self.part.mesh.vertices, self.part.mesh.faces)
 

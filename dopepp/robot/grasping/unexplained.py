@@ -60,11 +60,7 @@ def find_unexplained(
 ) -> UInt8[np.ndarray, "height width"]:
     """Return a mask of the pixels in the detected parts' colours, away from these parts.
 
-    Args:
-        image: RGB, without lens distortion.
-        K: Camera matrix, pixels.
-        mesh: Mesh of the parts.
-        poses: T_cam_obj of each detected part.
+    The image has no lens distortion; ``poses`` are T_cam_obj of the detected parts.
 
     Returns:
         1 in a region, else 0; 0 everywhere if colours do not distinguish the parts from the bench.

@@ -128,7 +128,6 @@ class Slot(Generic[Item]):
         self._thread.join(PATIENCE_S)
 
     def _run(self) -> None:
-        """Process images until :meth:`stop` is called; the thread's main function."""
         try:
             while True:
                 with self._fresh:

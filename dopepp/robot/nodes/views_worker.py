@@ -21,9 +21,7 @@ class ViewsWorker(Worker):
     Args:
         estimator: Estimator that refines by region.
         poses: Pose and calibration of each camera. None: the poses are those of :attr:`look_up`.
-        world: Name of the world frame.
         camera_error: See :meth:`PoseEstimator.predict_views`.
-        settings: Initial settings, with refinement.
         track: Track the parts from set to set.
 
     Raises:

@@ -96,8 +96,6 @@ class Worker:
     """Estimator of the poses in a stream of images; invalid images only cause warnings.
 
     Args:
-        estimator: Estimator of the poses in a single image.
-        settings: Initial settings (see :meth:`update`).
         camera: Camera of all images, in place of their ``camera_info``.
         frame_id: Name of the camera's optical frame, in place of the frame in the messages.
         track: Track the parts from frame to frame; this includes refinement.
@@ -162,7 +160,6 @@ class Worker:
         return self._answer(decoded.stamp, decoded.frame_id, result)
 
     def _answer(self, stamp: int, frame_id: str, result: PoseResult | ViewsResult) -> Answer:
-        """Return an answer, and count it."""
         self.problem = ""
         self._number += 1
         return Answer(stamp, frame_id, result)
@@ -245,7 +242,6 @@ class Worker:
             self._restart()
 
     def _restart(self) -> None:
-        """Forget all tracked parts."""
         if self._tracker is not None:
             self._tracker = PoseTracker(self._estimator(True))
 

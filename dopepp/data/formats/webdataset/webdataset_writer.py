@@ -15,12 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.files import encode_image, partial_path, write_file
-from dopepp.data.formats import (
-    STAGING,
-    encode_by_key,
-    read_object,
-    stage_item,
-)
+from dopepp.data.formats import STAGING, encode_by_key, read_object, stage_item
 from dopepp.data.formats.bop.bop_writer import BopFolder
 from dopepp.data.formats.images import encode_runs
 from dopepp.data.formats.webdataset import KEY_FILE, TarMember, members, read_span

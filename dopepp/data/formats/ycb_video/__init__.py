@@ -209,7 +209,6 @@ def read_frame(
 
 
 def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
-    """Read an 8-bit RGB image, with an alpha channel if ``alpha``."""
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
         problem, allowed = f"shape {image.shape}, {image.dtype}", f"8 bits and {3 + alpha} channels"
