@@ -102,8 +102,9 @@ def solve_pnp(
     Raises:
         ValueError: The arguments differ in length, or K is not an invertible pinhole matrix.
     """
-    object_points = np.asarray(object_points, np.float64).reshape(-1, 3)
-    image_points = np.asarray(image_points, np.float64).reshape(-1, 2)
+    # Copies of one memory layout: another one would compile :func:`_prepare` again.
+    object_points = np.array(object_points, np.float64, order="C").reshape(-1, 3)
+    image_points = np.array(image_points, np.float64, order="C").reshape(-1, 2)
     if len(object_points) != len(image_points):
         raise ValueError(
             f"got {len(object_points)} object points, {len(image_points)} image points"
@@ -111,8 +112,7 @@ def solve_pnp(
     K, n = np.ascontiguousarray(K, np.float64), len(object_points)
     if not (K.shape == (3, 3) and _is_pinhole(K)):
         raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
-    covariances = np.broadcast_to(np.asarray(covariance_px, np.float64), (n, 2, 2))
-    covariances = np.ascontiguousarray(covariances)
+    covariances = np.broadcast_to(covariance_px, (n, 2, 2)).astype(np.float64, order="C")
     rays, whitening, usable = _prepare(object_points, image_points, K, covariances)
     points = Points(object_points[usable], rays, whitening)
     result = _solve(points, K[:2, :2].copy(), widenings)

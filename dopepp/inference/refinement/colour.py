@@ -155,9 +155,9 @@ def log_odds(
     rows = _tile_of(bins.shape[0], top * thinned, height * thinned, tiles)
     counts = np.zeros((2, tiles, tiles, STEPS**3), np.float32)
     sparse = (
-        bins[::thinned, ::thinned][counted],
-        rows[::thinned][counted[0]],
-        columns[::thinned][counted[1]],
+        np.ascontiguousarray(bins[::thinned, ::thinned][counted]),
+        np.ascontiguousarray(rows[::thinned][counted[0]]),
+        np.ascontiguousarray(columns[::thinned][counted[1]]),
     )
     limits = unsure_within, unsure, unsure + ring
     if _count(*sparse, within, beyond, *limits, counts) < FEWEST:

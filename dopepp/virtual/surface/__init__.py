@@ -90,7 +90,7 @@ def make_surface(mesh: Mesh) -> Surface:
         UserError: The mesh has no faces, a value that is not finite, or a wrong vertex index.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
-    faces = np.ascontiguousarray(mesh.faces, np.int32)
+    faces = np.array(mesh.faces, np.int32, order="C")  # read-only faces would compile again
     fix = "repair the mesh or export it again"
     if len(faces) == 0 or not np.isfinite(vertices).all():
         problem = f"a mesh of {len(vertices)} vertices and {len(faces)} faces to render"

@@ -171,6 +171,7 @@ def _bake(
     depth = np.empty((side, side, 1), np.float32)
     ids = np.empty((side, side, 1), np.int32)
     T, P = np.zeros((4, 4)), np.empty((3, 4), np.float32)
+    zero = np.int64(0)  # a literal would compile the rasteriser again
     for k in range(directions.shape[0]):
         dx, dy, dz = directions[k]
         # The camera's x and y axes are arbitrary.
@@ -192,7 +193,9 @@ def _bake(
             for c in range(4):
                 P[r, c] = K[r, 0] * T[0, c] + K[r, 1] * T[1, c] + K[r, 2] * T[2, c]
         depth[:] = 0.0
-        rasterise(hom, faces, closed, distance - 2.0 * radius, (0, 0), samples, depth, ids, 0)
+        rasterise(
+            hom, faces, closed, distance - 2.0 * radius, (zero, zero), samples, depth, ids, zero
+        )
         for p in range(points.shape[0]):
             f = ground[p]
             facing = flat[f, 0] * dx + flat[f, 1] * dy + flat[f, 2] * dz

@@ -71,11 +71,13 @@ def region_terms(
     """
     H, g = np.zeros((7, 7)), np.zeros(7)
     independent, alike = min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing
-    _terms(rows, shifts.mean, shifts.information, *prior, independent, alike, H, g)
+    prior_H, prior_g = map(np.ascontiguousarray, prior)
+    mean, information = map(np.ascontiguousarray, (shifts.mean, shifts.information))
+    _terms(rows, mean, information, prior_H, prior_g, independent, alike, H, g)
     # The Schur complement eliminates the offset.
     last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
     H, g = H[:6, :6] - last[:, None] * H[:6, 6], g[:6] - last * g[6]
-    _eliminate_scale(H, g, *prior, position, max(scale_error, 1e-9))
+    _eliminate_scale(H, g, prior_H, prior_g, position, max(scale_error, 1e-9))
     return H, g
 
 
