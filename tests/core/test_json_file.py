@@ -1,7 +1,7 @@
 import json
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.core.errors import UserError
@@ -17,7 +17,6 @@ PLAIN = st.recursive(
 )
 
 
-@settings(max_examples=60)
 @given(PLAIN, st.booleans(), st.sampled_from([None, 1]))
 def test_parses_like_the_json_module(value, ascii_only, indent):
     text = json.dumps(value, ensure_ascii=ascii_only, indent=indent)
@@ -60,7 +59,6 @@ def test_brackets_in_strings_do_not_count_as_nesting():
     assert parse_json(deepest, "here") == json.loads(deepest)
 
 
-@settings(max_examples=100)
 @given(st.binary(max_size=60) | st.text("[]{}\":,\\ntrue1.e-NaInfy 'u", max_size=60))
 def test_any_bytes_give_a_value_or_a_user_error(content):
     try:

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.data.sample import (
@@ -29,7 +29,6 @@ def dot_sample(size: tuple[int, int], dot: tuple[float, float]) -> Sample:
     return Sample(image, np.eye(3), [instance], depth)
 
 
-@settings(max_examples=30)
 @given(
     x=st.floats(0.25, 0.75),
     y=st.floats(0.25, 0.75),
@@ -51,7 +50,6 @@ def test_a_bright_dot_moves_with_its_keypoint(x, y, size, target):
     np.testing.assert_allclose(mask_centre, centre, atol=0.6 * max(1, scale))
 
 
-@settings(max_examples=30)
 @given(width=st.integers(50, 700), height=st.integers(50, 700), side=st.sampled_from([128, 416]))
 def test_keypoints_and_camera_follow_one_rule(width, height, side):
     K = np.array([[1.1 * width, 0, 0.4 * width], [0, 1.2 * width, 0.6 * height], [0, 0, 1]])

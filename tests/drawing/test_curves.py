@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.core.files import read_csv
@@ -27,7 +27,6 @@ ERRORS = st.lists(
 
 
 @given(ERRORS)
-@settings(max_examples=60)
 def test_a_curve_counts_errors_strictly_below_a_threshold_and_its_legend_has_the_exact_auc(errors):
     thresholds, accuracy = accuracy_curve(np.array(errors))
     below = [sum(error < threshold for error in errors) for threshold in thresholds]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -89,7 +89,6 @@ def test_a_line_between_points_far_outside_crosses_the_image():
     st.integers(1, 40),
     st.integers(1, 40),
 )
-@settings(max_examples=60)
 def test_any_keypoints_on_any_image_are_drawn_without_an_error(points, width, height):
     frames = [Wireframe(points, BLUE, "a long name")]  # its legend is cut off
     assert overlay(black(width, height), frames, width).shape == (height, width, 3)

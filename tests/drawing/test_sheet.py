@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.drawing import curves, sheet
@@ -47,7 +47,6 @@ def test_a_long_line_is_pale_with_its_average_and_a_dashed_line_stays_dashed():
     assert [item.get_linestyle() for item in (smooth, other)] == ["-", "--"]
 
 
-@settings(max_examples=30)
 @given(num=st.integers(1, 400), slope=st.floats(-3, 3))
 def test_smoothing_keeps_length_level_and_straight_lines(num, slope):
     values = 5 + slope * np.arange(num, dtype=float)

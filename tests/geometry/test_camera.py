@@ -69,7 +69,7 @@ def test_a_resized_camera_projects_to_resized_points():
 SIZES = st.tuples(st.integers(1, 3000), st.integers(1, 3000))
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(SIZES, SIZES)
 def test_a_letterbox_fits_and_can_be_inverted(size, input_size):
     box = Letterbox.fit(size, input_size)

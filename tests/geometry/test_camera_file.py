@@ -157,7 +157,7 @@ def test_further_models_of_colmap(line, lens, tmp_path):
 NUMBERS = st.floats(-1e6, 1e6).map(lambda number: 0.0 if abs(number) < 1e-300 else number)
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from(["yaml", "yml", "xml", "json"]),
     st.tuples(st.floats(1e-3, 1e6), st.floats(1e-3, 1e6), NUMBERS, NUMBERS),
@@ -252,7 +252,7 @@ SAMPLES = [ROS, ECHOED, OPENCV_2, OPENCV_XML, BOP, NDDS, COLMAP.format("PINHOLE 
 MARKS = [b"[", b"{", b"-", b": ", b"&a ", b"!!", b"<", b"1e999", b"\n"]
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
     content = bytearray(data.draw(st.sampled_from(SAMPLES)).encode())

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, norm, t
 
@@ -56,7 +56,6 @@ def test_intervals_of_few_seeds_are_wide_enough(num_seeds):
     assert hits > 0.9 * 150
 
 
-@settings(max_examples=40)
 @given(
     seed=st.integers(0, 10_000), num=st.integers(1, 30), seeds=st.integers(1, 3),
     name=st.sampled_from(["mean", "median"]), same=st.booleans(),
@@ -74,7 +73,6 @@ def test_exchanging_the_methods_negates_the_interval(seed, num, seeds, name, sam
     assert (itself.value, itself.within_noise, itself.num_differing) == (0, True, 0)
 
 
-@settings(max_examples=60)
 @given(values=st.lists(st.floats(0, 180) | st.just(np.inf) | st.just(np.nan), min_size=1))
 def test_the_median_is_of_the_finite_numbers(values):
     finite = [value for value in values if np.isfinite(value)]
@@ -159,7 +157,6 @@ def test_values_that_cannot_be_paired_are_a_user_error(mine, baseline, message):
         difference(mine, baseline)
 
 
-@settings(max_examples=50)
 @given(st.floats(0.005, 0.1), st.floats(0.001, 0.2), st.floats(0, 0.02), st.integers(2, 6))
 def test_the_estimated_number_of_seeds_makes_a_difference_significant(gain, spread, noise, seeds):
     """With this number of seeds, the interval for known spreads just excludes 0."""

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose
@@ -67,7 +67,6 @@ def test_add_equals_the_loop(near):
     assert_allclose(add(R_est, t_est, R_gt, t_gt, points), expected, rtol=REL)
 
 
-@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     count=st.sampled_from([1, 2, 7, 8, 9, 16, 17, 33, 200, 1000]),
@@ -96,7 +95,6 @@ def test_chunks_change_nothing(monkeypatch):
 
 
 @given(arrays(float, 3, elements=st.floats(-1, 1)), arrays(float, 3, elements=st.floats(-4, 4)))
-@settings(max_examples=40)
 def test_a_pure_translation_is_its_own_length(shift, rotvec):
     R = torch.from_numpy(Rotation.from_rotvec(rotvec).as_matrix())[None]
     t = torch.tensor([[0.1, -0.2, 0.9]], dtype=torch.float64)
@@ -127,7 +125,6 @@ def test_reprojection_error_equals_opencv():
 @example(math.radians(1e-6), np.array([0.0, 1, 0]), 0)
 @example(math.pi, np.array([0.0, 1, 0]), 0)
 @given(st.floats(0, math.pi), arrays(np.float64, 3, elements=st.floats(-1, 1)), st.integers(0, 99))
-@settings(max_examples=60)
 def test_rotation_error_equals_scipy(angle, axis, seed):
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-3 else np.array([1.0, 0, 0])
     base = Rotation.random(random_state=seed)
@@ -138,7 +135,6 @@ def test_rotation_error_equals_scipy(angle, axis, seed):
     assert rotation_error_deg(*matrices).item() == pytest.approx(magnitude, rel=REL, abs=1e-13)
 
 
-@settings(max_examples=40)
 @given(
     seed=st.integers(0, 10_000),
     count=st.sampled_from([1, 2, 8, 9, 200]),

@@ -4,7 +4,7 @@ from dataclasses import make_dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -51,7 +51,6 @@ def matched_loop(errors, threshold):
     return len(taken)
 
 
-@settings(max_examples=100)
 @given(st.integers(0, 4), st.integers(1, 4), st.integers(0, 2**32 - 1))
 def test_matching_is_the_plain_loop(num_estimates, num_targets, seed):
     errors = np.random.default_rng(seed).integers(0, 5, (num_estimates, num_targets)) / 4
@@ -134,7 +133,6 @@ def test_targets_are_listed_or_visible_and_limit_the_number_of_estimates():
     assert scores([([right], [truth(pose(), wanted=False)])]) is None
 
 
-@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_add_or_s_is_over_the_vertices(seed, symmetric):
     """As in bop_toolkit, by plain loops; the part's own ADD points lie elsewhere."""

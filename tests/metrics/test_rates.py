@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest, chi2
 
@@ -46,7 +46,6 @@ ERRORS = st.lists(
 
 
 @given(ERRORS)
-@settings(max_examples=80)
 def test_auc_equals_loops(errors):
     values = torch.tensor(errors, dtype=torch.float64)
     exact = sum(1 - e / 0.1 for e in errors if e <= 0.1) / max(len(errors), 1)
@@ -98,7 +97,6 @@ def test_match_of_special_cases(scores, distances, expected):
 
 
 @given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
-@settings(max_examples=60)
 def test_match_equals_a_plain_loop(p, g, seed):
     rng = np.random.default_rng(seed)
     scores, distances, radius = rng.random(p), rng.uniform(0, 0.2, (p, g)), rng.uniform(0, 0.2)
@@ -112,7 +110,6 @@ def test_match_equals_a_plain_loop(p, g, seed):
     assert result.tolist() == expected
 
 
-@settings(max_examples=60)
 @given(seed=st.integers(0, 100_000), count=st.integers(1, 40))
 def test_average_precision_is_its_definition(seed, count):
     rng = np.random.default_rng(seed)
@@ -145,7 +142,6 @@ def test_average_recall_is_the_mean_of_strict_pass_rates():
     assert (len(BOP_THRESHOLDS), BOP_THRESHOLDS[2], BOP_MSPD_THRESHOLDS[-1]) == (10, 0.15, 50.0)
 
 
-@settings(max_examples=100)
 @given(st.integers(0, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_wilsons_interval_is_scipys(counts):
     passed, num = counts
@@ -158,7 +154,6 @@ def test_wilsons_interval_is_scipys(counts):
     assert 0 <= low <= passed / num <= high <= 1
 
 
-@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 60))
 def test_calibration_error_is_its_definition(seed, count):
     rng = np.random.default_rng(seed)
@@ -180,7 +175,6 @@ def test_calibration_error_of_extreme_scores():
     assert expected_calibration_error(ONES, ~TRUE) == 1.0
 
 
-@settings(max_examples=60)
 @given(st.lists(st.floats(0, 40) | st.sampled_from([1e3, 1e200]), max_size=30))
 def test_levels_of_regions_are_those_of_chi_squared(distances):
     expected = chi2.cdf(np.square(distances), 6)

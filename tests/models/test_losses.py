@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.models.layers import find_activation
@@ -49,7 +49,6 @@ def test_mse_is_the_sum_over_stages_of_both_errors():
 
 
 @given(st.integers(0, 1000), st.floats(0, 15), st.floats(0, 15), st.floats(-8, 0), st.booleans())
-@settings(max_examples=30)
 def test_terms_are_the_poisson_divergence(seed, x, y, level, second):
     """The sum of Σ e^z − g·z − g + g·log g over the cells, in Gaussians, is where + count."""
     generator = torch.Generator().manual_seed(seed)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -195,7 +195,6 @@ def test_corners_behind_the_camera_are_ignored():
     assert np.isfinite(detection_features(detection(T_cam_obj=near), CUBOID, K)).all()
 
 
-@settings(max_examples=50)
 @given(belief=st.floats(0, 1), error=st.floats(0, 1e6), variance=st.floats(0, 1e12))
 def test_features_of_any_detection_are_finite(belief, error, variance):
     item = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import scipy.stats
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.virtual import sensor as steps
@@ -24,7 +24,6 @@ def test_the_default_sensor_changes_nothing(image):
     assert capture(image, Sensor()) is image
 
 
-@settings(max_examples=40)
 @given(
     exposure=st.floats(-8, 8),
     blur=st.floats(0, 5),

@@ -3,7 +3,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.data.hybrid import VIRTUAL, HybridSource, WindowedSource
@@ -31,7 +31,6 @@ def items(source: HybridSource, epoch: int) -> list[tuple[str, str]]:
     return [(sample.source, sample.key) for sample in samples]
 
 
-@settings(max_examples=50)
 @given(
     real=st.builds(named, st.just("real"), st.integers(1, 12)),
     virtual=st.builds(named, st.just("virtual"), st.integers(1, 40)),

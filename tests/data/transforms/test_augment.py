@@ -3,7 +3,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.data.transforms.augment import Photometric
@@ -22,7 +22,6 @@ def only(**options: Any) -> Photometric:
     return Photometric(**(OFF | options))
 
 
-@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), epoch=st.integers(0, 100))
 def test_pure_function_of_the_generator(seed, epoch):
     image = np.random.default_rng(1).integers(0, 256, (20, 30, 3), np.uint8)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.data.rendered import RenderedSource
@@ -33,7 +33,6 @@ def posed(rng: np.random.Generator) -> tuple[Sample, np.ndarray]:
     return Sample(np.full((96, 128, 3), 90, np.uint8), K, [item]), corners
 
 
-@settings(max_examples=50)
 @given(seed=st.integers(0, 2**31), roll=st.floats(0, 180), shift=st.floats(0, 0.4))
 def test_keypoints_are_the_posed_points_of_the_new_camera(seed, roll, shift):
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
@@ -52,7 +52,6 @@ def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
     return rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
 
 
-@settings(max_examples=80)
 @given(
     st.builds(ellipse, st.floats(5, 55), st.floats(5, 75), st.floats(3, 25), st.floats(3, 30)),
     st.floats(0.1, 1.0),
@@ -206,7 +205,6 @@ def source_of(pixels: np.ndarray) -> np.ndarray:
     return np.column_stack([np.argsort(ROWS)[pixels[:, 0]], np.argsort(COLUMNS)[pixels[:, 1]]])
 
 
-@settings(max_examples=60)
 @given(
     st.builds(ellipse, st.floats(10, 60), st.floats(10, 80), st.floats(5, 25), st.floats(5, 30)),
     st.floats(0, 1),
@@ -272,7 +270,6 @@ def test_a_larger_share_contains_a_smaller_share():
         assert (other[1].sample.image != together[1].sample.image).any()
 
 
-@settings(max_examples=40)
 @given(
     masks=st.lists(
         st.tuples(st.floats(15, 55), st.floats(20, 75), st.floats(6, 18), st.floats(6, 20)),

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
@@ -91,7 +91,6 @@ def test_quantities_in_closed_form(measured):
     np.testing.assert_allclose(values["rotation"], np.degrees(np.arccos(cosines)), atol=1e-6)
 
 
-@settings(max_examples=100)
 @given(
     values=st.lists(st.integers(0, 12) | st.floats(0, 12), max_size=60), num_bins=st.integers(1, 8)
 )

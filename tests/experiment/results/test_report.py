@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.data.sample import Instance, Sample
@@ -25,7 +25,6 @@ def make_report(share: float | None = 0.5) -> Report:
     return Report("dopepp", rows("dopepp", share), references, errors, Cost(1, 1.5, 7.25), 4)
 
 
-@settings(max_examples=30)
 @given(
     errors=st.lists(st.floats(0, 10) | st.just(np.inf), max_size=5),
     share=st.none() | st.floats(0, 1),

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -226,7 +226,6 @@ def test_outline_pulls_a_shifted_part_back(box):
         assert abs(step[1]) < 0.002
 
 
-@settings(max_examples=30)
 @given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
 def test_prior_measures_turns_and_shifts(step):
     prior = make_prior(TRUE, 0.1)

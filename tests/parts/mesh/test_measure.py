@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
@@ -9,7 +9,6 @@ from dopepp.parts import servoholder
 from dopepp.parts.mesh import SurfaceTree, largest_distance, sample_surface, weld
 
 
-@settings(max_examples=60)
 @given(
     num_points=st.integers(2, 80),
     seed=st.integers(0, 2**32 - 1),

@@ -3,7 +3,7 @@ import logging
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from trimesh.exchange.stl import export_stl
 
@@ -48,7 +48,6 @@ def test_edges_agree_with_trimesh():
     assert topology_of(soup, np.arange(len(soup)).reshape(-1, 3)).is_closed
 
 
-@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1), whole=st.booleans())
 def test_any_closed_solid_ends_up_facing_outwards(seed, share, whole):
     rng = np.random.default_rng(seed)

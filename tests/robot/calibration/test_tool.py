@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +19,6 @@ def touching(rotations, noise=0.0, seed=0):
     return np.array([make_transform(*pair) for pair in pairs])
 
 
-@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.integers(4, 20))
 def test_the_tip_is_exact_without_noise(seed, num):
     tip = find_tip(touching(Rotation.random(num, rng=np.random.default_rng(seed))))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dopepp.geometry.camera import make_transform
@@ -28,7 +28,6 @@ def denavit_hartenberg(joints):
     return T
 
 
-@settings(max_examples=30)
 @given(angles)
 def test_the_flange_agrees_with_the_closed_form(arm, joints):
     ours, theirs = arm.flange(np.array(joints)), denavit_hartenberg(joints)
@@ -36,7 +35,6 @@ def test_the_flange_agrees_with_the_closed_form(arm, joints):
     np.testing.assert_allclose(ours[:3, 2], theirs[:3, 2], atol=1e-3)
 
 
-@settings(max_examples=30)
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 2, st.floats(0.18, 0.4), st.floats(-1.5, 1.5)))
 def test_inverse_kinematics_reaches_poses_over_the_tray(arm, position):
     x, y, z, yaw = position

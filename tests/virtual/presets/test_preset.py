@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
@@ -162,7 +162,6 @@ def test_a_window_larger_than_the_image_is_centred_on_it():
     assert 0 <= PRESETS["quickstart"].K[1, 2] - K[1, 2] <= 32
 
 
-@settings(max_examples=50)
 @given(st.integers(0, 10_000), st.floats(-3, 3), st.floats(0.5, 2.0), st.integers(200, 800))
 def test_working_placement_keeps_the_distance_and_fits_the_image(seed, origin, nearest, width):
     rng = np.random.default_rng(seed)
@@ -195,7 +194,6 @@ def test_field_of_view_follows_the_width():
 SIDES = st.integers(16, 800)
 
 
-@settings(max_examples=50)
 @given(st.integers(0, 10_000), st.floats(0.1, 1.0), SIDES, SIDES, st.floats(0.3, 4.0))
 def test_fill_placement_reaches_its_share(seed, share, width, height, focal):
     rng = np.random.default_rng(seed)

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.linalg import polar
@@ -171,7 +171,6 @@ def test_scenes_images_targets_and_shares(tmp_path):
         keys(targets=TARGETS)
 
 
-@settings(max_examples=60)
 @given(st.integers(1, 200), st.lists(st.floats(0.01, 0.99), max_size=4, unique=True))
 def test_shares_are_disjoint_and_complete(num_items, inner):
     bounds = [0.0, *sorted(inner), 1.0]

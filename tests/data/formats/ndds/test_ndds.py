@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -271,7 +271,6 @@ def test_every_convention_is_determined(tmp_path, order, unit, convention, frame
 
 
 @given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(["xyzw", "wxyz"]))
-@settings(max_examples=25)
 def test_a_single_instance_is_enough(tmp_path_factory, seed, order):
     foreign = ForeignWriter(tmp_path_factory.mktemp("one"), order=order)
     foreign.rng = np.random.default_rng(seed)

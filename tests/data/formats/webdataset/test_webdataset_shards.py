@@ -8,7 +8,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis.extra import numpy as hnp
 
 from dopepp.core.errors import UserError
@@ -69,7 +69,6 @@ def test_the_library_and_tarfile_read_the_shards(written, samples):
             assert (info.mtime, info.uid, info.uname) == (0, 0, "dopepp")
 
 
-@settings(max_examples=60)
 @given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))
 def test_runs_round_trip(mask):
     record = encode_runs(mask)
