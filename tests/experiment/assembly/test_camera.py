@@ -3,6 +3,7 @@
 import logging
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,9 +37,10 @@ SMALL = ("data.samples_per_epoch=8", "data.batch_size=4", "data.num_val=2", "dat
 
 
 @pytest.fixture
-def camera(tmp_path):
-    path = tmp_path / "cam.yaml"
-    path.write_text(CAMERA)
+def camera(tmp_path, monkeypatch):
+    """A camera file whose name is the same in every test's config."""
+    monkeypatch.chdir(tmp_path)
+    (path := Path("cam.yaml")).write_text(CAMERA)
     return path
 
 

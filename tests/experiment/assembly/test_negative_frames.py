@@ -1,6 +1,7 @@
 """Frames without the part: sizes, kinds and photos."""
 
 import logging
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,13 +22,15 @@ from dopepp.experiment.run.resume import describe_images, differing_images
 
 
 @pytest.fixture
-def photos(tmp_path):
-    """A folder of twelve different photos."""
+def photos(tmp_path, monkeypatch):
+    """A folder of twelve different photos; its name is the same in every test's config."""
+    monkeypatch.chdir(tmp_path)
+    (folder := Path("photos")).mkdir()
     rng = np.random.default_rng(0)
     for number in range(12):
         noise = rng.integers(0, 256, (150, 200, 3), np.uint8)
-        assert cv2.imwrite(str(tmp_path / f"{number}.png"), cv2.GaussianBlur(noise, (9, 9), 3))
-    return tmp_path
+        assert cv2.imwrite(str(folder / f"{number}.png"), cv2.GaussianBlur(noise, (9, 9), 3))
+    return folder
 
 
 def frames(config, split, count=6):
@@ -35,7 +38,7 @@ def frames(config, split, count=6):
 
 
 def test_frames_of_a_preset_are_large_and_alternate_between_kinds(tiny, photos):
-    config = tiny(f"virtual.backgrounds={photos}")
+    config = tiny("virtual.backgrounds=./photos")
     source = frames(config, "val", 4)
     samples = [source.sample(index) for index in range(len(source))]
     assert [sample.source for sample in samples] == [PHOTOS, SCENES, LOOKALIKES, PHOTOS]
@@ -73,7 +76,7 @@ def test_procedural_backgrounds_are_tuned_and_tested_on_the_photos_of_the_packag
 
 
 def test_negative_photos_are_divided_between_training_tuning_and_test(tiny, photos):
-    config = tiny(f"virtual.negative_photos={photos}")
+    config = tiny("virtual.negative_photos=./photos")
     keys = {}
     for split in ("val", "test"):
         source = frames(config, split, 8)
@@ -92,7 +95,7 @@ def test_negative_photos_are_divided_between_training_tuning_and_test(tiny, phot
 
 
 def test_changed_photos_change_the_described_images(tiny, photos):
-    config = tiny(f"virtual.backgrounds={photos}")
+    config = tiny("virtual.backgrounds=./photos")
 
     def described(split):
         module = build_datamodule(config.data, build_parts(config.data), 0)
@@ -112,17 +115,17 @@ def test_changed_photos_change_the_described_images(tiny, photos):
 def test_too_few_photos_are_rejected(tiny, photos):
     for number in range(6, 12):
         (photos / f"{number}.png").unlink()
-    assert len(frames(tiny(f"virtual.backgrounds={photos}"), "val")) == 6
+    assert len(frames(tiny("virtual.backgrounds=./photos"), "val")) == 6
     (photos / "0.png").unlink()
     with pytest.raises(UserError, match=r"with 5 photos, .*at least 6 different"):
-        frames(tiny(f"virtual.backgrounds={photos}"), "val")
+        frames(tiny("virtual.backgrounds=./photos"), "val")
 
 
 def test_training_on_an_undivided_folder_is_warned_about(tiny, photos, caplog):
     for number in range(5, 12):
         (photos / f"{number}.png").unlink()
     with caplog.at_level(logging.WARNING):
-        backgrounds = training_backgrounds(tiny(f"virtual.backgrounds={photos}").data)
+        backgrounds = training_backgrounds(tiny("virtual.backgrounds=./photos").data)
     assert backgrounds.identity()[:2] == ["photos", "5"]
     (message,) = [record.getMessage() for record in caplog.records]
     assert "fewer than 6 different photos" in message

@@ -56,7 +56,7 @@ def table_of(experiment: str) -> dict[str, Any]:
 
 
 @pytest.fixture
-def compare_golden(tmp_path, monkeypatch, capsys):
+def compare_golden(blank_figures, tmp_path, monkeypatch, capsys):
     """Compare the terminal's output and some files with a stored text."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["/somewhere/train.py", "-m", "seed=1,2"])

@@ -15,6 +15,8 @@ from dopepp.experiment.results.paper import PaperTable
 from dopepp.experiment.sweep.multirun import CompareJobs
 from tests.experiment.conftest import report_of, write_run
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 FOLDER = Path(__file__).parents[3] / "conf" / "experiment"
 EXPERIMENTS = sorted(
     path.stem for path in FOLDER.glob("*.yaml") if path.stem.startswith(("table", "fig"))
