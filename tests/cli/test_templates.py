@@ -73,22 +73,24 @@ def test_doctor_reports_that_no_pose_is_verified(run, near_truth, truth):
     assert first.startswith("!! visibility: no pose of pivconnector passes the verification; fix: ")
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("piv.stl",), "got a mesh without a working distance"),
-        (("piv.stl", "--working-distance", "0.3"), "got --working-distance 0.3; allowed: NEAR,FAR"),
-        (("piv.stl", "--working-distance", "0.5,0.3"), "working_distance=(0.5, 0.3)"),
-        (("piv.stl", *RANGE, "--tilt", "200"), "tilt_deg=200"),
-        (("piv.stl", *RANGE, "--unit", "feet"), "unit='feet'"),
-        (("piv.stl", *RANGE, "--device", "cuda"), "got --device cuda with the mesh piv.stl"),
-        (("none.stl", *RANGE), "none.stl, no such file"),
-        ((RELEASED, *RANGE), f"got --working-distance with the checkpoint {RELEASED}"),
-        ((RELEASED, "--tilt", "40"), f"got --tilt with the checkpoint {RELEASED}"),
-        ((RELEASED, "--unit", "mm"), f"got --unit with the checkpoint {RELEASED}"),
-    ],
-)
-@pytest.mark.parametrize("command", ["predict", "node", "doctor", "benchmark"])
+WRONG = [
+    (("piv.stl",), "got a mesh without a working distance"),
+    ((RELEASED, *RANGE), f"got --working-distance with the checkpoint {RELEASED}"),
+    (("piv.stl", "--working-distance", "0.3"), "got --working-distance 0.3; allowed: NEAR,FAR"),
+    (("piv.stl", "--working-distance", "0.5,0.3"), "working_distance=(0.5, 0.3)"),
+    (("piv.stl", *RANGE, "--tilt", "200"), "tilt_deg=200"),
+    (("piv.stl", *RANGE, "--unit", "feet"), "unit='feet'"),
+    (("piv.stl", *RANGE, "--device", "cuda"), "got --device cuda with the mesh piv.stl"),
+    (("none.stl", *RANGE), "none.stl, no such file"),
+    ((RELEASED, "--tilt", "40"), f"got --tilt with the checkpoint {RELEASED}"),
+    ((RELEASED, "--unit", "mm"), f"got --unit with the checkpoint {RELEASED}"),
+]
+
+
+@pytest.mark.parametrize(("command", "words", "message"), [
+    *(("predict", *case) for case in WRONG),
+    *((command, *case) for command in ("node", "doctor", "benchmark") for case in WRONG[:2]),
+])  # fmt: skip
 def test_wrong_options_are_one_line(refused, truth, intrinsics, command, words, message):
     model, *options = words
     commands = {

@@ -39,8 +39,6 @@ def test_symmetric_bodies_are_their_own_mirror_images_in_any_pose(body):
     rng = np.random.default_rng(0)
     turned = mesh.vertices @ random_rotation(rng).T + rng.normal(size=3)
     assert mirror_distance(Mesh(turned, mesh.faces)) < 0.01
-    names = [part.name for part in lookalikes([make_part("body", mesh)])]
-    assert names == ["body, stretched", "body, cut"]
 
 
 def test_a_body_that_only_a_point_reflects_is_its_own_mirror_image():
@@ -50,8 +48,12 @@ def test_a_body_that_only_a_point_reflects_is_its_own_mirror_image():
     assert mirror_distance(Mesh(cube.vertices @ edges, cube.faces)) < 0.01
 
 
+def test_a_symmetric_part_has_no_mirrored_copy():
+    copies = lookalikes([make_part("body", mesh_of(box((0.1, 0.06, 0.03))))])
+    assert [copy.name for copy in copies] == ["body, stretched", "body, cut"]
+
+
 def test_a_chiral_part_has_a_mirrored_copy():
-    assert mirror_distance(CHIRAL) > 0.02
     part = make_part("arms", CHIRAL)
     mirrored, stretched, cut = copies = lookalikes([part])
     assert [copy.name for copy in copies] == ["arms, mirrored", "arms, stretched", "arms, cut"]
