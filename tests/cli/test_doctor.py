@@ -57,7 +57,6 @@ def test_problems_come_first(run, folder, options, line, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        (["good.png"], "neither --K nor --camera"),
         (["good.png", "--camera", "K.txt", "--at", "5"], "--at 5; allowed: u,v in pixels"),
         (["good.png", "--camera", "K.txt", "--at", "5,5", "--empty"], "--at together with --empty"),
         (["K.txt", "--camera", "K.txt"], "cannot identify the format"),

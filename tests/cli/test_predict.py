@@ -102,7 +102,6 @@ def test_the_distortion_of_the_lens_is_corrected(poses, folder, rendered, tmp_pa
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("whole.png", [], "neither --K nor --camera"),
         ("whole.png", ["--camera", "K.txt", "--K", "9", "9", "9", "9"], "--K and --camera"),
         ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
         ("whole.png", ["--camera", "whole.png"], "camera file"),
