@@ -171,7 +171,7 @@ def _bake(
     depth = np.empty((side, side, 1), np.float32)
     ids = np.empty((side, side, 1), np.int32)
     T, P = np.zeros((4, 4)), np.empty((3, 4), np.float32)
-    zero = np.int64(0)  # a literal would compile the rasteriser again
+    zero = 0 * side  # a literal would compile the rasteriser again
     for k in range(directions.shape[0]):
         dx, dy, dz = directions[k]
         # The camera's x and y axes are arbitrary.
