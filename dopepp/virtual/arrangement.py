@@ -165,22 +165,23 @@ def arrange_floating(
 def _draw_pose(composition: Composition, body: Body) -> Transform:
     """Sample T_cam_obj from the preset's turning and placement."""
     preset, rng = composition.preset, composition.rng
-    rotation = preset.turning.draw(rng)
-    turned = body.surface.hull @ rotation.T
+    rotation, centre = preset.turning.draw(rng), body.surface.centre
+    turned = (body.surface.hull - centre) @ rotation.T
     position = preset.placement.draw(rng, composition.K, composition.size, turned)
-    return make_transform(rotation, position)
+    return make_transform(rotation, position - rotation @ centre)
 
 
 def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
     """Yield poses T_cam_obj; up to :data:`_REDRAWS` of them share an orientation."""
     while True:
         pose = _draw_pose(composition, body)
+        offset = pose[:3, :3] @ body.surface.centre
         for _ in range(_REDRAWS):
             yield pose
-            position = composition.preset.placement.redraw(composition.rng, pose[:3, 3])
-            if position is None:
+            centre = composition.preset.placement.redraw(composition.rng, pose[:3, 3] + offset)
+            if centre is None:
                 break
-            pose = make_transform(pose[:3, :3], position)
+            pose = make_transform(pose[:3, :3], centre - offset)
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:

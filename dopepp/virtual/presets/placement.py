@@ -116,7 +116,11 @@ def looking_down(elevation: float) -> RotationMatrix:
 
 
 class _Placement(Checked):
-    """Base of the placements; a placement samples an object's origin in the camera frame."""
+    """Base of the placements.
+
+    A placement samples where the centre of an object's bounding box is in the camera frame. The
+    origin of a CAD file may be far from its part.
+    """
 
     _ends: ClassVar[tuple[str, str] | None] = None  # names of the smallest and largest value
 
@@ -170,7 +174,7 @@ class OffsetPlacement(_Placement):
             )
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Sample the object's origin in the camera frame, metres."""
+        """Sample the centre of the object's box in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
         return np.array([x, y, self._draw_depth(rng)])
 
@@ -185,12 +189,12 @@ class OffsetPlacement(_Placement):
 
 @dataclass(frozen=True)
 class DistancePlacement(_Placement):
-    """Uniform in the depth of the object's origin and, laterally, over the image.
+    """Uniform in the depth of the object's centre and, laterally, over the image.
 
     Attributes:
         nearest: Smallest depth, metres.
         farthest: Largest depth, metres.
-        margin: Smallest distance of the origin from the border, in image widths and heights.
+        margin: Smallest distance of the centre from the border, in image widths and heights.
     """
 
     _ends = ("nearest", "farthest")
@@ -201,7 +205,7 @@ class DistancePlacement(_Placement):
     kind: Literal["distance"] = "distance"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Sample the object's origin in the camera frame, metres."""
+        """Sample the centre of the object's box in the camera frame, metres."""
         depth = rng.uniform(self.nearest, self.farthest)
         pixel = rng.uniform(self.margin, 1 - self.margin, 2) * size - 0.5
         return np.asarray(depth * np.linalg.solve(K, [*pixel, 1.0]))
@@ -226,9 +230,9 @@ class FillPlacement(_Placement):
     kind: Literal["fill"] = "fill"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Sample the object's origin in the camera frame, metres.
+        """Sample the centre of the object's box in the camera frame, metres.
 
-        ``rotated_hull`` has the vertices of the convex hull relative to the origin, camera axes.
+        ``rotated_hull`` has the vertices of the convex hull relative to this centre, camera axes.
         """
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)
@@ -268,7 +272,7 @@ class WorkingPlacement(_Placement):
     kind: Literal["working"] = "working"
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Sample the object's origin in the camera frame, metres."""
+        """Sample the centre of the object's box in the camera frame, metres."""
         depth, offset = rng.uniform(self.nearest, self.farthest), rng.uniform(-0.5, 0.5, 2)
         lower, upper = rotated_hull.min(axis=0), rotated_hull.max(axis=0)
         # The front of the part appears larger than its middle.

@@ -62,6 +62,11 @@ class Surface:
         return float(np.linalg.norm(self.hull, axis=1).max())
 
     @cached_property
+    def centre(self) -> Vector:
+        """Centre of the bounding box, object frame, metres."""
+        return np.asarray((self.hull.min(axis=0) + self.hull.max(axis=0)) / 2)
+
+    @cached_property
     def diameter(self) -> float:
         """Largest distance between two vertices, metres."""
         return largest_distance(self.hull)

@@ -11,6 +11,7 @@ from scipy.stats import kstest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import is_rotation, random_rotation
+from dopepp.parts.part import make_part
 from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.body import Distractors
 from dopepp.virtual.presets import preset_of, resolve_base
@@ -174,6 +175,24 @@ def test_working_placement_keeps_the_distance_and_fits_the_image(seed, origin, n
     pixels = project(there, K) + 0.5
     assert pixels.min() > -1e-6
     assert (pixels < np.array([width, 200]) + 1e-6).all()
+
+
+def test_a_placement_is_that_of_the_part_wherever_its_file_has_the_origin(parts):
+    part = parts[0]
+    shift = np.array([0.3, -0.2, 0.1])
+    moved = make_part(part.name, replace(part.mesh, vertices=part.mesh.vertices + shift))
+    preset = replace(
+        PRESETS["paper"].resized(160, 120),
+        placement=DistancePlacement(0.2, 0.5),
+        targets_per_image=(1, 1),
+    )
+    for scene in draw_scenes([moved], preset, 2, 10):
+        (number,) = scene.targets
+        vertices = part.mesh.vertices + shift
+        centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        middle = transform(scene.objects[number].T_cam_obj, centre[None])
+        assert 0.2 <= middle[0, 2] <= 0.5
+        assert (np.abs(project(middle, scene.K) / [160, 120] - 0.5) < 0.41).all()
 
 
 def test_depths_hold(parts):
