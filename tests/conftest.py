@@ -239,7 +239,7 @@ def near_truth(monkeypatch):
                 starts.append(self.start(shift @ T, 0.5, K))
             return starts
 
-        def silhouette(self, T):
+        def silhouette(self, T, image, K):
             return 1.0
 
         def half_turned(self, T):

@@ -38,7 +38,13 @@ from dopepp.inference.templates.ranking import learned_ranking
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part, check_name
 from dopepp.parts.symmetry_finder import find_symmetries
-from dopepp.recovery.detection import Detection, RecoveryOptions, log_odds, recalibrate
+from dopepp.recovery.detection import (
+    Detection,
+    RecoveryOptions,
+    log_odds,
+    recalibrate,
+    to_probability,
+)
 from dopepp.recovery.recover import Reason
 
 NUM_REFINED: Final = 20  # number of start poses of each part that are refined
@@ -167,13 +173,17 @@ class TemplateEstimator(PoseEstimator):
         pose is also refined after half turns. Tracked poses are refined only once. Under a time
         limit, all poses are refined once, until the time is spent.
         """
-        if self.max_ms is not None or any(start.agreement is not None for start in detections):
+        if any(start.agreement is not None for start in detections):
             return super().refined(detections, image, K, depth)
+        if self.max_ms is not None:
+            return self._refined_once(detections, image, K, depth)
         ends: list[Detection] = []
         for detector in self.detectors:
             starts = [start for start in detections if start.object == detector.part.name]
             best = self._most_promising(starts, image, K)
-            poses = sorted(super().refined(best, image, K, depth), key=_probability, reverse=True)
+            poses = sorted(
+                self._refined_once(best, image, K, depth), key=_probability, reverse=True
+            )
             chosen = distinct_poses([pose.T_cam_obj for pose in poses], detector.part)
             group = [
                 self._refined_again(detector, poses[number], image, K, depth)
@@ -184,6 +194,26 @@ class TemplateEstimator(PoseEstimator):
             group += self._half_turned(detector, group, image, K, depth)
             ends += self._without_look_alikes(detector, group, image, K)
         return ends
+
+    def _refined_once(
+        self,
+        detections: Sequence[Detection],
+        image: RGBImage,
+        K: CameraMatrix,
+        depth: Depth | None,
+    ) -> list[Detection]:
+        """Refine detections, and lower the probabilities of poses with small silhouettes.
+
+        Small silhouettes resemble many objects: a plate seen edge-on fits every stick, and a part
+        that is cut off by the border of the image fits many corners.
+        """
+        detectors = {detector.part.name: detector for detector in self.detectors}
+        ends = super().refined(detections, image, K, depth)
+        areas = [detectors[end.object].silhouette(end.T_cam_obj, image, K) for end in ends]
+        return [
+            replace(end, probability=to_probability(log_odds(_probability(end)) + math.log(area)))
+            for end, area in zip(ends, areas, strict=True)
+        ]
 
     def _most_promising(
         self, starts: list[Detection], image: RGBImage, K: CameraMatrix
@@ -213,7 +243,7 @@ class TemplateEstimator(PoseEstimator):
         """Refine a pose again while its probability increases, at most ``REPEATS`` times."""
         for _ in range(REPEATS):
             start = detector.start(end.T_cam_obj, end.score, K)
-            (new,) = super().refined([start], image, K, depth)
+            (new,) = self._refined_once([start], image, K, depth)
             if new.kept or _probability(new) <= _probability(end):
                 break
             end = new
@@ -233,10 +263,10 @@ class TemplateEstimator(PoseEstimator):
         """
         if not ends:
             return []
-        best = max(ends, key=partial(_evidence, detector))
+        best = max(ends, key=_probability)
         turned = detector.half_turned(best.T_cam_obj)
         starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
-        poses = super().refined(starts, image, K, depth)
+        poses = self._refined_once(starts, image, K, depth)
         return [self._refined_again(detector, pose, image, K, depth) for pose in poses]
 
     def _without_look_alikes(
@@ -250,7 +280,7 @@ class TemplateEstimator(PoseEstimator):
         if not ends:
             return []
         assert self.refiner is not None  # templates are always refined
-        evidence = [_evidence(detector, end) for end in ends]
+        evidence = [log_odds(_probability(end)) for end in ends]
         order = sorted(range(len(ends)), key=lambda index: -evidence[index])
         best = ends[order[0]]
         same = [index for index in order if are_same(ends[index], best)]
@@ -264,10 +294,8 @@ class TemplateEstimator(PoseEstimator):
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
         slope, scored = self.recovery.refined_verification, []
-        detectors = {detector.part.name: detector for detector in self.detectors}
         for detection in refined:
-            handicap = _silhouette_handicap(detectors[detection.object], detection)
-            bias = -slope * (handicap + self.levels.get(detection.object, 0.0))
+            bias = -slope * self.levels.get(detection.object, 0.0)
             options = replace(self.recovery, refined_bias=bias)
             scored += recalibrate([detection], options, by_depth)
         return merge_scales([[detection] for detection in scored])
@@ -313,19 +341,6 @@ def _probability(detection: Detection) -> float:
     return detection.probability or 0.0
 
 
-def _evidence(detector: TemplateDetector, detection: Detection) -> float:
-    """Return the log odds that exceed those a pose with its silhouette must have."""
-    return log_odds(_probability(detection)) - _silhouette_handicap(detector, detection)
-
-
-def _silhouette_handicap(detector: TemplateDetector, detection: Detection) -> float:
-    """Return the additional log odds that a pose with a small silhouette must have.
-
-    Small silhouettes resemble many objects: a plate seen edge-on fits every stick.
-    """
-    return -math.log(detector.silhouette(detection.T_cam_obj))
-
-
 def _largest_log_odds(
     detector: TemplateDetector,
     distances: tuple[float, float],
@@ -343,7 +358,7 @@ def _largest_log_odds(
     levels = []
     for image in images:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        levels.append(max((_evidence(detector, end) for end in ends), default=0.0))
+        levels.append(max((log_odds(_probability(end)) for end in ends), default=0.0))
     return levels
 
 

@@ -45,6 +45,7 @@ from dopepp.inference.templates.views import (
 )
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.recovery.detection import log_odds
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import preset_of
 
@@ -399,7 +400,11 @@ def test_the_silhouette_of_a_ball_has_the_area_of_its_disc():
     T = np.eye(4)
     T[2, 3] = 0.1
     disc = np.pi / 4 / (1 - 0.3**2)  # the sine of half the angle that it covers is 0.3
-    assert TemplateDetector(part, DISTANCES).silhouette(T) == pytest.approx(disc, rel=0.02)
+    detector, image = TemplateDetector(part, DISTANCES), np.zeros((480, 640, 3), np.uint8)
+    K = camera_matrix(600, 600, 319.5, 239.5)
+    assert detector.silhouette(T, image, K) == pytest.approx(disc, rel=0.02)
+    T[0, 3] = -319.5 / 600 * 0.1  # the centre is on the left border
+    assert detector.silhouette(T, image, K) == pytest.approx(disc / 2, rel=0.1)
 
 
 def test_half_turns_keep_the_centre_the_tilt_and_the_symmetries(detector, rendered):
@@ -431,21 +436,17 @@ def test_half_turns_keep_the_centre_the_tilt_and_the_symmetries(detector, render
     assert TemplateDetector(symmetric, DISTANCES, tilt_deg=5).half_turned(upright) == []
 
 
-def test_a_thin_silhouette_needs_more_evidence(detector, rendered):
+def test_a_thin_silhouette_needs_more_evidence(detector, rendered, monkeypatch):
     estimator = TemplateEstimator([detector], DISTANCES)
-    _, K, T = rendered
+    image, K, T = rendered
     edge_on = T.copy()
     edge_on[:3, :3] = np.eye(3)[[0, 2, 1]] * [1, 1, -1]
-    seen, thin = (
-        replace(detector.start(pose, 0.5, K), probability=0.9, agreement=0.9, support=0.9)
-        for pose in (T, edge_on)
+    monkeypatch.setattr(
+        estimator, "refiner", lambda start, *_: replace(start, probability=0.9, kept="")
     )
-    scores = [
-        float(np.log(it.score / (1 - it.score)))
-        for end in (seen, thin)
-        for it in estimator._recalibrated([end], False)
-    ]
-    ratio = detector.silhouette(T) / detector.silhouette(edge_on)
+    starts = [detector.start(pose, 0.5, K) for pose in (T, edge_on)]
+    seen, thin = (end.probability for end in estimator._refined_once(starts, image, K, None))
+    ratio = detector.silhouette(T, image, K) / detector.silhouette(edge_on, image, K)
     assert ratio > 2
-    slope = estimator.recovery.refined_verification
-    assert scores[0] - scores[1] == pytest.approx(slope * np.log(ratio))
+    assert log_odds(seen) - log_odds(thin) == pytest.approx(np.log(ratio))
+    assert log_odds(seen) == pytest.approx(log_odds(0.9) + np.log(detector.silhouette(T, image, K)))

@@ -26,11 +26,11 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
-    camera_matrix,
     crop_camera,
     focal_length,
     make_transform,
     project_keypoints,
+    resize_camera,
 )
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.geometry.symmetry import symmetry_group
@@ -197,13 +197,18 @@ class TemplateDetector:
         cosine = T_cam_obj[:3, 2] @ to_camera / np.linalg.norm(to_camera)
         return math.acos(min(max(float(cosine), -1.0), 1.0))
 
-    def silhouette(self, T_cam_obj: Transform) -> float:
-        """Return the area of the part's silhouette at a pose, squared diameters."""
-        x, y, z = T_cam_obj[:3, :3] @ self._centre + T_cam_obj[:3, 3]
-        focal = SILHOUETTE_PX * z / self.part.diameter
-        u, v = SILHOUETTE_PX - focal * np.array([x, y]) / z
-        posed_mesh = posed(self._mesh, T_cam_obj, camera_matrix(focal, focal, u, v))
-        size = 2 * SILHOUETTE_PX, 2 * SILHOUETTE_PX
+    def silhouette(self, T_cam_obj: Transform, image: RGBImage, K: CameraMatrix) -> float:
+        """Return the area of the part's silhouette on an image, squared projected diameters.
+
+        Args:
+            T_cam_obj: Pose, metres.
+            image: Image whose borders limit the silhouette.
+            K: Camera matrix, pixels.
+        """
+        depth = float((T_cam_obj[:3, :3] @ self._centre + T_cam_obj[:3, 3])[2])
+        scale = SILHOUETTE_PX * depth / (self.part.diameter * focal_length(K))
+        posed_mesh = posed(self._mesh, T_cam_obj, resize_camera(K, scale, scale))
+        size = math.ceil(scale * image.shape[1]), math.ceil(scale * image.shape[0])
         area = 0 if posed_mesh is None else int(filled_mask(self._mesh, posed_mesh, size).sum())
         return max(area, 1) / SILHOUETTE_PX**2
 
