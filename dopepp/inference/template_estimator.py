@@ -53,6 +53,11 @@ REPEATS: Final = 2  # number of further refinements
 MAX_DIFFERENCE: Final = 2.0  # difference of log odds below which look-alikes are compared
 MIN_TURN: Final = math.radians(45.0)  # smallest rotation between the poses of look-alikes
 
+# Limits of the working distance, diameters. A nearer part surrounds the camera. A farther part is
+# too small at any usual focal length.
+MIN_DIAMETERS: Final = 0.5
+MAX_DIAMETERS: Final = 300.0
+
 SCALE_ERROR: Final = 0.001
 """Default of ``scale_error``. It is small, so that refinement corrects the distance, because
 templates determine the distance only roughly."""
@@ -111,6 +116,8 @@ class TemplateEstimator(PoseEstimator):
                 "state it: --working-distance 0.3,0.5 (working_distance=(0.3, 0.5) in Python)",
             )
         checked = check("working_distance", distances, tuple[float, float], METRES)
+        for part in parts:
+            _check_size(part, checked)
         tilt = check("tilt_deg", tilt_deg, float, Range(0, 180, "degrees"))
         detectors = [TemplateDetector(part, checked, tilt) for part in parts]
         estimator = cls(detectors, checked, refine, max_ms, scale_error)
@@ -280,16 +287,16 @@ class TemplateEstimator(PoseEstimator):
         if not ends:
             return []
         assert self.refiner is not None  # templates are always refined
-        evidence = [log_odds(_probability(end)) for end in ends]
-        order = sorted(range(len(ends)), key=lambda index: -evidence[index])
-        best = ends[order[0]]
-        same = [index for index in order if are_same(ends[index], best)]
-        for index in same:
-            turn = rotation_angle(ends[index].T_cam_obj[:3, :3].T @ best.T_cam_obj[:3, :3])
-            is_close = evidence[index] > evidence[order[0]] - MAX_DIFFERENCE and turn > MIN_TURN
-            if is_close and self.refiner.prefers(ends[index], best, image, K):
-                best = ends[index]
-        return [best] + [ends[index] for index in order if index not in same]
+        ends = sorted(ends, key=_probability, reverse=True)
+        best, least = ends[0], log_odds(_probability(ends[0])) - MAX_DIFFERENCE
+        same = [end for end in ends if are_same(end, best)]
+        others = [end for end in ends if not are_same(end, best)]
+        for end in same:
+            turn = rotation_angle(end.T_cam_obj[:3, :3].T @ best.T_cam_obj[:3, :3])
+            is_close = log_odds(_probability(end)) > least and turn > MIN_TURN
+            if is_close and self.refiner.prefers(end, best, image, K):
+                best = end
+        return [best, *others]
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""
@@ -334,6 +341,21 @@ class TemplateEstimator(PoseEstimator):
             UserError: Templates have no checkpoint.
         """
         raise _networks_only("a checkpoint")
+
+
+def _check_size(part: Part, distances: tuple[float, float]) -> None:
+    """Raise a UserError if the part has another order of magnitude than the distances.
+
+    Then the unit of the mesh or that of the distances is wrong.
+    """
+    nearest, farthest = (distance / part.diameter for distance in distances)
+    if nearest > MAX_DIAMETERS or farthest < MIN_DIAMETERS:
+        raise UserError(
+            f"working_distance from {distances[0]:g} to {distances[1]:g} m and {part.name} of "
+            f"{part.diameter:.3g} m",
+            f"{MIN_DIAMETERS:g} to {MAX_DIAMETERS:g} diameters of the part",
+            "state the distances in metres, and check the unit of the mesh",
+        )
 
 
 def _probability(detection: Detection) -> float:

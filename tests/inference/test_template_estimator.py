@@ -160,6 +160,8 @@ def test_options_reach_the_part_and_the_detector(near_truth, tmp_path):
     [
         ({"working_distance": None}, "without a working distance"),
         ({"working_distance": (0.5, 0.3)}, "working_distance"),
+        ({"working_distance": (300.0, 500.0)}, "300 to 500 m and pivconnector of .* in metres"),
+        ({"working_distance": (0.01, 0.02)}, "0.5 to 300 diameters .* unit of the mesh"),
         ({"tilt_deg": 200.0}, "tilt_deg"),
         ({"refine": "depth"}, "refine=depth"),
         ({"unit": "foot"}, "foot"),
