@@ -1,8 +1,8 @@
 """Measured values, of which all tables are views.
 
 :func:`means` averages a list of :class:`Value` over seeds, and :func:`pivot` arranges the values as
-a table, which :func:`markdown`,
-:func:`~dopepp.core.files.write_csv` or :func:`~dopepp.experiment.results.display.show_table` write.
+a table, which :func:`markdown`, :func:`~dopepp.core.files.write_csv` or
+:func:`~dopepp.experiment.results.display.show_table` write.
 The module also defines the pass rates that all protocols report (:class:`PassRate`).
 """
 

@@ -33,8 +33,14 @@ from dopepp.experiment.results.folder import FAILURE_FILE, write_json
 _MOST: Final = 1024
 
 _ANYWHERE: Final = (
-    "timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node", "mem_gb", "name",
-)  # fmt: skip
+    "timeout_min",
+    "nodes",
+    "tasks_per_node",
+    "cpus_per_task",
+    "gpus_per_node",
+    "mem_gb",
+    "name",
+)
 """Options that every submitit cluster accepts; other options get the prefix ``slurm_``."""
 
 
