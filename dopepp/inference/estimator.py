@@ -189,6 +189,12 @@ class PoseEstimator:
         refining._refine_by(refine, parts or self.parts)
         return refining
 
+    def with_own_times(self) -> PoseEstimator:
+        """Return an estimator with the same network, and :attr:`spent_ms` of its own."""
+        changed = copy.copy(self)
+        changed.spent_ms = dict.fromkeys(STEPS, 0.0)
+        return changed
+
     @property
     def parts(self) -> Sequence[Part]:
         """Detected parts, in the order of the network's outputs."""

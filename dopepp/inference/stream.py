@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict, Unpack
+from typing import TYPE_CHECKING, Final, NamedTuple, TypedDict, Unpack
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
@@ -15,12 +18,16 @@ from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_formats import Size
 from dopepp.inference.frames import CameraFrame, SourceLike, open_sources
 from dopepp.inference.frames.source import Lens, choose_camera
-from dopepp.inference.network_input import Depth, Distances, Region
-from dopepp.inference.pose_result import PoseResult, Shape, elapsed_by_step, make_shape
+from dopepp.inference.network_input import Depth, Distances, Region, prepare_image
+from dopepp.inference.pose_result import PoseResult, Shape, make_shape
 from dopepp.inference.tracker import PoseTracker
+from dopepp.recovery.detection import Detection
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
+
+MAX_AGE_S: Final = 0.05
+"""Time after which a camera's frame is too old for its poses to be reported next, seconds."""
 
 
 class StreamOptions(TypedDict, total=False):
@@ -49,6 +56,8 @@ def stream(
 
     Frames of a camera or network stream that arrive while the estimator is busy are dropped: each
     result belongs to the newest frame. Files are read to their end, cameras without end.
+
+    While the poses in one frame are refined, a thread detects the parts in the next frame.
 
     Args:
         estimator: Detects the parts.
@@ -79,48 +88,97 @@ def stream(
             raise UserError(problem, "one image", fix)
         read_depth = None if path is None else partial(lens.read_depth, path, scale)
         tracker = PoseTracker(estimator) if options.get("track") else None
-        given, cropped = (estimator, tracker, shapes), lens.crop is not None
-        for frame in opened.frames(stride):
-            yield estimate_frame(*given, frame, lens.undistort, cropped, read_depth, distances, roi)
+        given = estimator, shapes, lens.undistort, lens.crop is not None, tracker
+        frame_estimator = FrameEstimator(*given, read_depth, distances, roi)
+        frames = opened.frames(stride)
+        if tracker is not None or opened.count == 1:
+            yield from map(frame_estimator, frames)
+        else:
+            yield from _overlapped(frame_estimator, frames, MAX_AGE_S if opened.is_live else None)
 
 
-def estimate_frame(
-    estimator: PoseEstimator,
-    tracker: PoseTracker | None,
-    shapes: Mapping[str, Shape],
-    frame: CameraFrame,
-    undistort: Callable[[RGBImage], tuple[RGBImage, CameraMatrix]],
-    cropped: bool,
-    read_depth: Callable[[CameraMatrix], Depth] | None = None,
-    distances: Distances | None = None,
-    roi: Region | None = None,
-) -> PoseResult:
-    """Detect the parts in one frame or, with a tracker, track them.
+class DetectedFrame(NamedTuple):
+    """Frame of a source with its detections before refinement."""
 
-    Args:
-        estimator: Estimator with the minimum score of the result.
-        tracker: Tracker of the source; None without tracking.
-        shapes: Shape of each part, for drawing.
-        frame: Frame of the source.
-        undistort: Returns an image without lens distortion, and its K.
-        cropped: Whether the image may be a crop; see :meth:`PoseEstimator.predict`.
-        read_depth: Returns the depth image for K; not with a tracker, like ``distances`` and
-            ``roi`` of :meth:`PoseEstimator.predict`.
-        distances: Expected depths of the parts.
-        roi: Region to process.
+    frame: CameraFrame
+    estimator: PoseEstimator  # measures the times of this frame only
+    image: RGBImage  # without lens distortion
+    K: CameraMatrix
+    depth: Depth | None = None
+    starts: Sequence[Detection] = ()  # empty with a tracker
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEstimator:
+    """Estimates the poses in the frames of a source.
+
+    :meth:`detect` can process the next frame in another thread during :meth:`refine`, except with a
+    tracker.
     """
-    before, identities = dict(estimator.spent_ms), None
-    with estimator.timed("pre"):
-        image, K = undistort(frame.image)
-    if tracker is None:
-        depth = None if read_depth is None else read_depth(K)
-        candidates = estimator.candidates(image, K, None, depth, distances, roi, cropped)
-        detections, weaker = estimator.split(candidates)
-    else:
-        tracker.estimator = estimator
-        tracks, weaker = tracker.track(image, K, cropped), tracker.weaker
-        detections = [track.detection for track in tracks]
-        identities = [track.identity for track in tracks]
-    speed = elapsed_by_step(before, estimator.spent_ms)
-    source, threshold = (frame.name, frame.number, frame.time), estimator.min_score
-    return PoseResult(image, K, detections, speed, *source, identities, shapes, weaker, threshold)
+
+    estimator: PoseEstimator
+    shapes: Mapping[str, Shape]  # shape of each part, for drawing
+    undistort: Callable[[RGBImage], tuple[RGBImage, CameraMatrix]]
+    cropped: bool = False  # whether images may be crops; see PoseEstimator.predict
+    tracker: PoseTracker | None = None  # tracks parts from frame to frame
+    read_depth: Callable[[CameraMatrix], Depth] | None = None  # not supported with a tracker
+    distances: Distances | None = None  # expected depths; not supported with a tracker
+    roi: Region | None = None  # region to process; not supported with a tracker
+
+    def __call__(self, frame: CameraFrame) -> PoseResult:
+        """Detect or track the parts in one frame."""
+        return self.refine(self.detect(frame))
+
+    def detect(self, frame: CameraFrame) -> DetectedFrame:
+        """Undistort a frame and, without a tracker, detect the parts."""
+        estimator = self.estimator.with_own_times()
+        with estimator.timed("pre"):
+            image, K = self.undistort(frame.image)
+        if self.tracker is not None:
+            return DetectedFrame(frame, estimator, image, K)
+        depth = None if self.read_depth is None else self.read_depth(K)
+        image, K, depth = prepare_image(image, K, None, depth, self.cropped)
+        starts, _ = estimator.start_detections(image, K, self.distances, self.roi)
+        return DetectedFrame(frame, estimator, image, K, depth, starts)
+
+    def refine(self, detected: DetectedFrame) -> PoseResult:
+        """Refine the detections or, with a tracker, track the parts."""
+        frame, estimator, image, K, depth, starts = detected
+        identities = None
+        if self.tracker is None:
+            detections, weaker = estimator.split(estimator.candidates_from(starts, image, K, depth))
+        else:
+            self.tracker.estimator = estimator
+            tracks, weaker = self.tracker.track(image, K, self.cropped), self.tracker.weaker
+            detections = [track.detection for track in tracks]
+            identities = [track.identity for track in tracks]
+        source, threshold = (frame.name, frame.number, frame.time), estimator.min_score
+        speed = estimator.spent_ms
+        return PoseResult(
+            image, K, detections, speed, *source, identities, self.shapes, weaker, threshold
+        )
+
+
+def _overlapped(
+    frame_estimator: FrameEstimator, frames: Iterator[CameraFrame], max_age_s: float | None
+) -> Iterator[PoseResult]:
+    """Yield the poses in frames, while a thread detects the parts in the next frame.
+
+    If the caller keeps a result for longer than ``max_age_s``, the next frame of a camera is too
+    old. It is dropped in favour of the newest frame.
+    """
+
+    def detect_next() -> DetectedFrame | None:
+        frame = next(frames, None)
+        return None if frame is None else frame_estimator.detect(frame)
+
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="detect") as thread:
+        following = thread.submit(detect_next)
+        while (detected := following.result()) is not None:
+            following = thread.submit(detect_next)
+            result = frame_estimator.refine(detected)
+            yielded = time.monotonic()
+            yield result
+            if max_age_s is not None and time.monotonic() - yielded > max_age_s:
+                following.result()
+                following = thread.submit(detect_next)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,15 @@ def test_export_has_the_same_maps_for_any_batch_and_size(exported, original):
             # Vectors of a random network are up to 20 long, those of a trained network 1.
             size = max(1.0, float(other.abs().max()))
             torch.testing.assert_close(first / size, other / size, atol=1e-4, rtol=0)
+
+
+def test_export_serves_several_threads(exported):
+    network = PoseEstimator.load(exported).network
+    images = [random_images(1, 3, 32, side) for side in (32, 64, 96, 128) * 4]
+    alone = [network.maps(pixels)[0] for pixels in images]
+    with ThreadPoolExecutor(4) as threads:
+        for first, other in zip(alone, threads.map(network.maps, images), strict=True):
+            torch.testing.assert_close(first, other[0], atol=1e-5, rtol=1e-4)
 
 
 def test_renamed_export_is_the_same_estimator(exported, original, tmp_path):

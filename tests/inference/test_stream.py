@@ -1,11 +1,15 @@
 """``estimator.stream``: detections, tracks and times on images and videos."""
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
+from dopepp.inference.frames import CameraFrame, FrameSource
+from dopepp.inference.stream import MAX_AGE_S
 
 
 @pytest.fixture
@@ -71,3 +75,42 @@ def test_track_starts_with_a_detection_above_the_threshold(estimator, clip, K):
 def test_invalid_options_are_rejected(estimator, clip, options, message):
     with pytest.raises(UserError, match=message):
         list(estimator.stream(clip, **options))
+
+
+class Numbered(FrameSource):
+    """Source of equal frames that ends with an error."""
+
+    name = stem = "numbered"
+
+    def __init__(self, image, num_frames, is_live=False):
+        self.image, self.num_frames, self.is_live = image, num_frames, is_live
+
+    def frames(self, stride=1):
+        for number in range(self.num_frames):
+            yield CameraFrame(self.image, self.name, number)
+        raise UserError("a damaged frame", "a frame", "repeat the recording")
+
+
+def test_each_frame_of_a_source_has_its_own_result_until_an_error(estimator, piv_render, K):
+    (expected,) = estimator.predict(piv_render.image, K)
+    total = dict(estimator.spent_ms)
+    results = estimator.stream(Numbered(piv_render.image, 3), K)
+    for number in range(3):
+        result = next(results)
+        assert result.number == number
+        np.testing.assert_array_equal(result.detections[0].T_cam_obj, expected.T_cam_obj)
+        assert 0 < result.speed["network"] < 60_000
+    with pytest.raises(UserError, match="a damaged frame"):
+        next(results)
+    assert estimator.spent_ms == total
+
+
+@pytest.mark.parametrize(("is_live", "number"), [(False, 1), (True, 2)])
+def test_a_slow_caller_receives_the_newest_frame_of_a_camera(
+    estimator, piv_render, K, is_live, number
+):
+    results = estimator.stream(Numbered(piv_render.image, 9, is_live), K)
+    assert next(results).number == 0
+    time.sleep(2 * MAX_AGE_S)
+    assert next(results).number == number
+    results.close()

@@ -160,6 +160,8 @@ def _unreadable(path: Path, reason: str) -> UserError:
 class Live(FrameSource):
     """Frame source of a camera (number or device path) or a network stream (URL)."""
 
+    is_live = True
+
     def __init__(self, address: int | str) -> None:
         self._address = address
         self.name = f"camera {address}" if isinstance(address, int) else _without_login(address)

@@ -32,6 +32,7 @@ class FrameSource(ABC):
     stem: str  # file name without suffix for outputs about this source
     count: int | None = None  # number of frames; None if unknown
     rate: float | None = None  # frames per second; None for separate images
+    is_live: bool = False  # whether frames are lost while nobody reads them
 
     @property
     def camera(self) -> Camera | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
+import threading
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,11 +92,14 @@ class OpenVinoNetwork(ExportedNetwork):
     def __init__(self, model: Any, path: Path, checkpoint: Checkpoint, export: Export) -> None:
         super().__init__(path, checkpoint, export)
         self.request = compile_model(model).create_infer_request()
+        self._is_idle = threading.Lock()  # a request serves one thread at a time
 
     def run(self, pixels: Pixels) -> Arrays:
         """Return the belief maps and vector fields of images."""
-        self.request.infer([pixels])
-        belief, field = (self.request.get_output_tensor(number).data.copy() for number in range(2))
+        with self._is_idle:
+            self.request.infer([pixels])
+            tensors = [self.request.get_output_tensor(number) for number in range(2)]
+            belief, field = (tensor.data.copy() for tensor in tensors)
         return belief, field
 
 

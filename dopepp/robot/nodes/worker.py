@@ -14,13 +14,14 @@ from typing import Any, Final, NamedTuple
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
+from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
 from dopepp.inference.frames.ros import camera_of_info, decode_image, is_cropped, is_rectified
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
-from dopepp.inference.stream import estimate_frame
+from dopepp.inference.stream import FrameEstimator
 from dopepp.inference.tracker import PoseTracker
 from dopepp.recovery.detection import Detection
 
@@ -207,8 +208,11 @@ class Worker:
         """
         check_size(camera, frame.image)
         estimator = self._estimator(self.settings.refine).reporting(self.settings.confidence)
-        given = estimator, self._tracker, self._shapes, frame
-        return estimate_frame(*given, lambda image: (camera.undistorted(image), camera.K), cropped)
+
+        def undistort(image: RGBImage) -> tuple[RGBImage, CameraMatrix]:
+            return camera.undistorted(image), camera.K
+
+        return FrameEstimator(estimator, self._shapes, undistort, cropped, self._tracker)(frame)
 
     def _checked_frame(self, frame_id: str, info: Any | None, topic: str) -> str:
         """Return the name of the poses' frame; warn if it does not contain "optical"."""
