@@ -6,6 +6,7 @@ Figures are :class:`matplotlib.figure.Figure` objects without pyplot's global st
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,9 @@ from matplotlib.figure import Figure
 
 from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.pictures import RGBImage
+
+# On first use, matplotlib reports its list of fonts.
+logging.getLogger("matplotlib.font_manager").setLevel(logging.WARNING)
 
 MAX_THRESHOLD: Final = 0.1  # Largest threshold of accuracy-threshold curves, metres (paper Fig. 4)
 _NUM_STEPS: Final = 200  # of a curve, 0.5 mm each

@@ -1,13 +1,11 @@
 """Wireframes of cuboids, lines and text on an image, for the visual inspection of poses.
 
 A cuboid's +z face has bright, thick edges and an arrow head that points to +y. Two orientations of
-a cube therefore never look equal, unless that face is seen edge-on. Text uses matplotlib's font,
-because the fonts of cv2 are limited to ASCII.
+a cube therefore never look equal, unless that face is seen edge-on.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,9 +19,6 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
-# On first use, matplotlib reports its list of fonts.
-logging.getLogger("matplotlib.font_manager").setLevel(logging.WARNING)
-
 Colour = tuple[int, int, int]  # Red, green and blue, 0 to 255
 
 YELLOW: Final[Colour] = (255, 221, 0)
@@ -32,6 +27,7 @@ YELLOW: Final[Colour] = (255, 221, 0)
 GREEN: Final[Colour] = (40, 220, 60)  # Colour of the ground truth
 BLUE: Final[Colour] = (70, 165, 255)  # Colour of the DOPE baseline (paper Fig. 14)
 WHITE: Final[Colour] = (255, 255, 255)  # Colour of captions
+WEIGHT: Final = 500  # of the font's strokes; 400 is regular, 700 is bold
 MIN_WIDTH_PX: Final = 640  # narrower images are enlarged, for readable lines and legends
 
 _FRACTION_BITS: Final = 4  # sub-pixel coordinates of cv2 are integers, here in 1/16 pixel
@@ -197,21 +193,10 @@ def draw_tags(image: RGBImage, tags: Sequence[tuple[str, tuple[float, float], Co
 @lru_cache(maxsize=256)
 def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
     """Return each pixel's coverage by a line of text, in [0, 1]; cached, so do not modify it."""
-    # Imported on demand, so that a command that only prints poses starts faster.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # An em per glyph is wide enough; the result is cut to the measured width.
-    width = size_px * (len(text) + 1)
-    figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    # The em is 0.72 of the line, which leaves room for ascenders and descenders; at 100 dots per
-    # inch a pixel is 0.72 points.
-    points = 0.72 * size_px * 0.72
-    label = figure.text(
-        size_px / 4 / width, 0.28, text, fontsize=points, va="baseline", parse_math=False
-    )
-    canvas.draw()  # type: ignore[no-untyped-call]
-    used = int(np.ceil(label.get_window_extent().x1 + size_px / 4))
-    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-    return 1.0 - pixels[:, :used, 0] / 255.0
+    # Two ems per glyph are wide enough for all scripts; the result is cut to the measured width.
+    pixels = np.zeros((size_px, size_px * (2 * len(text) + 1)), np.uint8)
+    # The em is 0.66 of the line, which leaves room for ascenders and descenders.
+    margin, baseline, em = size_px // 4, round(0.74 * size_px), round(0.66 * size_px)
+    font = cv2.FontFace("sans")  # a font that OpenCV contains
+    (end, _), _ = cv2.putText(pixels, text, (margin, baseline), (255,), font, em, WEIGHT)
+    return pixels[:, : end + margin] / 255.0

@@ -1,5 +1,6 @@
 """Curves and the numbers in them."""
 
+import logging
 import math
 
 import matplotlib.pyplot as plt
@@ -90,3 +91,9 @@ def test_ratios_are_evenly_spaced_with_ticks_at_the_measured_values():
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0.5", "1", "2"]
     left, middle, right = axes.transData.transform([(x, 0) for x in (0.5, 1, 2)])[:, 0]
     assert middle - left == pytest.approx(right - middle)
+
+
+def test_the_list_of_fonts_is_not_reported(caplog):
+    with caplog.at_level(logging.INFO):
+        logging.getLogger("matplotlib.font_manager").info("generated new fontManager")
+    assert not caplog.records

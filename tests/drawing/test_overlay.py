@@ -1,7 +1,6 @@
 """Wireframes: their lines have the right position and colour, and nothing else is drawn."""
 
 import itertools
-import logging
 import math
 
 import numpy as np
@@ -123,9 +122,3 @@ def test_the_legend_names_each_label_once_in_its_colour():
     colours = frame[frame.sum(axis=2) > 300].astype(float)
     assert (colours / GREEN).std(axis=1).max() < 0.05
     assert not overlay(black(640, 480), [Wireframe(nowhere, GREEN)]).any()
-
-
-def test_the_list_of_fonts_is_not_reported(caplog):
-    with caplog.at_level(logging.INFO):
-        logging.getLogger("matplotlib.font_manager").info("generated new fontManager")
-    assert not caplog.records
