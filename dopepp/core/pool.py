@@ -1,4 +1,4 @@
-"""Pools that apply a function to many items: processes of this machine, or a Ray cluster.
+"""Pools that apply a function to many items: threads, processes of this machine, or a Ray cluster.
 
 A pool receives the pickled function once and yields each item with its future on completion. An
 exception or a lost process affects its own item only.
@@ -22,7 +22,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
@@ -36,6 +36,7 @@ from dopepp.core.errors import UserError, require
 _log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _LIMITED: Final = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMBA_NUM")
 
@@ -76,6 +77,18 @@ def num_threads() -> int:
     """Return ``OMP_NUM_THREADS`` if it is a positive integer, else :func:`physical_cores`."""
     text = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     return int(text) if text.isdecimal() and int(text) > 0 else physical_cores()
+
+
+def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Return a function's result for each item, computed in up to :func:`num_threads` threads.
+
+    The threads run at the same time only while the function has released the GIL, as compiled loops
+    and OpenCV do.
+    """
+    if len(items) < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(min(len(items), num_threads())) as threads:
+        return list(threads.map(function, items))
 
 
 def cpu_fact(*names: str) -> str:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, Unpack
 
@@ -17,6 +18,7 @@ from jaxtyping import Float
 from dopepp.core.compiled import compile_in_background
 from dopepp.core.errors import UserError
 from dopepp.core.extensions import enable
+from dopepp.core.pool import map_in_threads
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
@@ -417,20 +419,29 @@ class PoseEstimator:
         """
         if self.refiner is None:
             return list(detections)
-        refined: list[Detection] = []
         start = time.perf_counter()
         with self.timed("refine"):
-            for detection in detections:
-                if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
-                    unrefined = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
-                    refined.append(self.refiner.verified(unrefined, image, K))
-                    continue
-                best = self.refiner(detection, image, K, depth)
-                if detection.alternative is not None and (best.probability or 0.0) < PROBABLE:
-                    other = self.refiner(detection.alternative, image, K, depth)
-                    best = other if (other.probability or 0.0) >= PROBABLE else best
-                refined.append(replace(best, alternative=None))
-        return refined
+            refine = partial(self._refined, image, K, depth, start)
+            return map_in_threads(refine, detections)
+
+    def _refined(
+        self,
+        image: RGBImage,
+        K: CameraMatrix,
+        depth: Depth | None,
+        start: float,
+        detection: Detection,
+    ) -> Detection:
+        """Refine a detection or, ``max_ms`` after ``start``, only verify its pose."""
+        assert self.refiner is not None  # the caller has checked it
+        if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
+            unrefined = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
+            return self.refiner.verified(unrefined, image, K)
+        best = self.refiner(detection, image, K, depth)
+        if detection.alternative is not None and (best.probability or 0.0) < PROBABLE:
+            other = self.refiner(detection.alternative, image, K, depth)
+            best = other if (other.probability or 0.0) >= PROBABLE else best
+        return replace(best, alternative=None)
 
     def stream(
         self,

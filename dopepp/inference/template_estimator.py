@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from dopepp.core.errors import UserError
+from dopepp.core.pool import map_in_threads
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
@@ -233,7 +234,7 @@ class TemplateEstimator(PoseEstimator):
             return starts
         assert self.refiner is not None  # templates are always refined
         with self.timed("refine"):
-            fits = [self.refiner.coarse_fit(start, image, K) for start in starts]
+            fits = map_in_threads(partial(self.refiner.coarse_fit, image=image, K=K), starts)
         by_score = np.argsort([-start.score for start in starts], kind="stable")
         by_fit = np.argsort(-np.array(fits), kind="stable")
         order = dict.fromkeys(np.column_stack([by_score, by_fit]).ravel().tolist())
@@ -377,11 +378,12 @@ def _largest_log_odds(
     near, far = distances
     middle = math.sqrt(near * far)
     depths = max(near, middle / 2), min(far, 2 * middle)
-    levels = []
-    for image in images:
+
+    def largest(image: RGBImage) -> float:
         ends = estimator.refined(detector.detect(image, K, depths), image, K)
-        levels.append(max((log_odds(_probability(end)) for end in ends), default=0.0))
-    return levels
+        return max((log_odds(_probability(end)) for end in ends), default=0.0)
+
+    return map_in_threads(largest, list(images))
 
 
 def load_solid_part(

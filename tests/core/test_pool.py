@@ -5,6 +5,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -13,7 +14,7 @@ import pytest
 
 from dopepp.core import pool as pool_module
 from dopepp.core.errors import UserError
-from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool
+from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, map_in_threads
 
 
 def wait_for_group(process: int) -> None:
@@ -172,3 +173,21 @@ def test_an_address_without_a_cluster_is_refused_at_once(address):
     pytest.importorskip("ray")
     with pytest.raises(UserError, match=f"--ray-address {address}: .*ray start --head"):
         ClusterPool(EVALUATE, address, 1)
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_results_of_threads_are_in_the_order_of_the_items(threads, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", threads)
+    used = set()
+
+    def slowest_first(item):
+        used.add(threading.get_ident())
+        time.sleep(0.02 * (5 - item))
+        return item**2
+
+    assert map_in_threads(slowest_first, range(5)) == [0, 1, 4, 9, 16]
+    assert len(used) == int(threads)
+    with pytest.raises(ZeroDivisionError):
+        map_in_threads(lambda item: 1 / item, [1, 0])
+    assert map_in_threads(str, [7]) == ["7"]
+    assert map_in_threads(str, []) == []
