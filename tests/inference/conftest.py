@@ -15,7 +15,8 @@ def piv_estimator():
 
 
 @pytest.fixture(scope="session")
-def wide_estimator():
+def estimator():
+    """An estimator with the pretrained wide network."""
     return PoseEstimator.load("pretrained/pivconnector_wide", refine="region")
 
 
@@ -26,7 +27,7 @@ def piv_render():
 
 
 @pytest.fixture(scope="session")
-def wide_scene():
+def scene():
     """A scene with the part that the pretrained wide network detects."""
     return Factory([pivconnector()], PRESETS["wide"].reframed(640, 480), 4177).scene(0, 0)
 

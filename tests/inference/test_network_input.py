@@ -136,8 +136,8 @@ def test_two_detections_of_one_scale_are_two_instances():
 
 
 @pytest.fixture(scope="module")
-def estimator(wide_estimator):
-    return wide_estimator.refining(None)
+def estimator(estimator):
+    return estimator.refining(None)
 
 
 @pytest.fixture(scope="module")

@@ -18,16 +18,6 @@ from dopepp.virtual import render
 from dopepp.virtual.sensor import capture
 
 
-@pytest.fixture
-def estimator(wide_estimator):
-    return wide_estimator
-
-
-@pytest.fixture(scope="module")
-def scene(wide_scene):
-    return wide_scene
-
-
 def beside(target, axis):
     """Return T_new_cam of a camera that looks at a target from 25° beside it."""
     turn = rotation_vector_to_matrix(math.radians(25.0) * np.array(axis))
@@ -60,13 +50,23 @@ def errors(T, true):
     return turn, abs(along), np.linalg.norm(shift - along * ray)
 
 
-def test_second_view_determines_the_distance(estimator, scene, views, true):
-    images, poses = views
-    (alone,) = estimator.predict(images[0], scene.K)
+@pytest.fixture(scope="module")
+def alone(estimator, scene, views):
+    """The detection in the first view."""
+    (detection,) = estimator.predict(views[0][0], scene.K)
+    return detection
+
+
+@pytest.fixture(scope="module")
+def pair(estimator, scene, views):
+    """The result of the first two views."""
+    return predicted(estimator, scene, views)
+
+
+def test_second_view_determines_the_distance(estimator, scene, views, true, alone, pair):
     ray = true[:3, 3] / np.linalg.norm(true[:3, 3])
     variance_alone = float(ray @ alone.covariance[3:, 3:] @ ray)
-    for count in (2, 3):
-        result = estimator.predict_views(images[:count], [scene.K] * count, poses[:count])
+    for count, result in ((2, pair), (3, predicted(estimator, scene, views, (0, 1, 2)))):
         (detection,) = result.detections
         assert (np.array(errors(detection.T_world_obj, true)) < (0.4, 0.5, 0.3)).all()
         assert ray @ detection.covariance[3:, 3:] @ ray < 0.7 * variance_alone
@@ -77,9 +77,9 @@ def test_second_view_determines_the_distance(estimator, scene, views, true):
             assert view.detections == [item.detection]
 
 
-def test_world_may_be_any_frame(estimator, scene, views):
+def test_world_may_be_any_frame(estimator, scene, views, pair):
     T_other_world = move_pose(np.eye(4), np.array([0.4, -1.2, 2.0, 1.0, -2.0, 0.5]))
-    (detection,) = predicted(estimator, scene, views).detections
+    (detection,) = pair.detections
     elsewhere = [T_other_world @ T for T in views[1][:2]]
     (other,) = predicted(estimator, scene, views, poses=elsewhere).detections
     assert_allclose(other.T_world_obj, T_other_world @ detection.T_world_obj, atol=1e-6)
@@ -123,14 +123,13 @@ def test_wrong_camera_pose_is_reported(estimator, scene, views, axis, millimetre
     assert apart == pytest.approx(millimetres, abs=3)
 
 
-def test_disagreeing_views_are_reported(estimator, scene, views):
+def test_disagreeing_views_are_reported(estimator, scene, views, pair):
     """An error along the baseline changes the distance only, and a consistent pose remains."""
     _, poses = views
-    right = predicted(estimator, scene, views)
     result = predicted(estimator, scene, views, poses=[poses[0], shifted(poses[1], x=0.004)])
     (finding,) = result.findings
     assert "view 0 and view 1 disagree on pivconnector" in finding
-    assert volume(result) > volume(right)
+    assert volume(result) > volume(pair)
 
 
 def test_third_view_identifies_the_wrong_camera(estimator, scene, views):
@@ -158,9 +157,8 @@ def test_moved_part_is_not_averaged(estimator, scene, views, true):
     assert "the part was moved between the images" in result.findings[0]
 
 
-def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views):
+def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views, alone):
     images, _ = views
-    (alone,) = estimator.predict(images[0], scene.K)
     empty = np.full_like(images[1], 90)
     result = predicted(estimator, scene, views, images=[images[0], empty])
     (detection,) = result.detections

@@ -19,16 +19,6 @@ T_WORLD = move_pose(np.eye(4), np.array([0.4, -1.2, 2.0, 1.0, -2.0, 0.5]))
 BLACK = np.zeros((480, 640, 3), np.uint8)
 
 
-@pytest.fixture
-def estimator(wide_estimator):
-    return wide_estimator
-
-
-@pytest.fixture(scope="module")
-def scene(wide_scene):
-    return wide_scene
-
-
 @pytest.fixture(scope="module")
 def poses(scene):
     """Poses of two fixed cameras in the world."""
