@@ -98,7 +98,7 @@ def test_a_part_beside_an_unexplained_region_is_chosen_last():
 COVARIANCE = np.diag(np.repeat([np.radians(0.3), 1e-3], 3) ** 2)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def choose_view(trials, scene):
     planner, K = trials._planner(scene), scene.calibrated.camera.K
     return partial(choose_viewpoint, planner, K, scene.joints)

@@ -17,13 +17,22 @@ from dopepp.robot.grasping.planner import DISTURBING, MAX_HEIGHTS, align_with_be
 from dopepp.robot.grasping.selection import EstimatedPart
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def planner(trials, scene):
     return trials._planner(scene)
 
 
-def test_a_part_at_a_known_pose_is_caught(trials, scene):
-    attempt = trials.attempt(scene, PoseSource("exact"))
+@pytest.fixture(scope="module")
+def plan(planner, trials, scene):
+    return planner.plan(scene.targets, trials.grasps, scene.joints)
+
+
+@pytest.fixture(scope="module")
+def attempt(trials, scene):
+    return trials.attempt(scene, PoseSource("exact"))
+
+
+def test_a_part_at_a_known_pose_is_caught(attempt):
     record, states = attempt.record, attempt.outcome.states
     assert (record.caught, record.recognised, record.failure, record.add_mm) == (True, True, "", 0)
     # At the end, the part hangs above its initial position on the bench.
@@ -81,18 +90,16 @@ def test_a_heap_is_tried_until_it_is_empty_or_attempts_are_used_up(results, numb
     assert trials.failed == [sum(failures[:before]) for before in range(number)]
 
 
-def test_a_trial_depends_on_the_seed_alone(trials, scene):
+def test_a_trial_depends_on_the_seed_alone(trials, scene, attempt):
     trials.scene(1)  # another trial in between has no effect
     again = trials.scene(0)
     np.testing.assert_array_equal(again.image, scene.image)
     np.testing.assert_array_equal(again.T_base_cam, scene.T_base_cam)
-    first, second = (trials.attempt(each, PoseSource("exact")).outcome for each in (scene, again))
-    np.testing.assert_array_equal(first.states[-1], second.states[-1])
+    repeated = trials.attempt(again, PoseSource("exact"))
+    np.testing.assert_array_equal(attempt.outcome.states[-1], repeated.outcome.states[-1])
 
 
-def test_a_plan_descends_from_above_and_lifts(trials, scene, planner):
-    plan = planner.plan(scene.targets, trials.grasps, scene.joints)
-    assert plan is not None
+def test_a_plan_descends_from_above_and_lifts(trials, plan):
     flanges = [trials.arm.flange(joints) for joints in (*plan.descent, plan.lift[-1])]
     heights = [flange[2, 3] for flange in flanges]
     assert heights[0] - heights[-2] == pytest.approx(0.06, abs=0.001)
@@ -175,8 +182,7 @@ def test_a_motion_passes_its_waypoints_from_rest_to_rest(scene):
     np.testing.assert_allclose(speeds.sum(axis=0) * STEP, path[-1] - path[0], atol=1e-3)
 
 
-def test_a_plan_through_the_part_is_a_collision(trials, scene, planner):
-    plan = planner.plan(scene.targets, trials.grasps, scene.joints)
+def test_a_plan_through_the_part_is_a_collision(trials, scene, plan):
     execution = Execution(scene.cell, copy(scene.start), trials.gripper, scene.robot.zero)
     outcome = execution.run(replace(plan, opening=0.0))
     assert outcome.collided

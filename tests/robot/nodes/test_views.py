@@ -42,6 +42,14 @@ def stereo():
     return SimpleNamespace(images=images, K=scene.K, poses=poses, T_world_obj=T_world @ target)
 
 
+@pytest.fixture(scope="module")
+def expected(estimator, stereo):
+    """The detection of ``predict_views``."""
+    images, poses = stereo.images, stereo.poses
+    (detection,) = estimator.predict_views(images, [stereo.K] * 2, poses).detections
+    return detection
+
+
 @pytest.fixture
 def shots(stereo, messages):
     """Return a function that makes the shots of a set."""
@@ -63,11 +71,11 @@ def poses_of(stereo, camera=None):
 
 
 @pytest.mark.parametrize("track", [False, True])
-def test_poses_are_those_of_predict_views_in_the_world(estimator, stereo, shots, track, warnings):
+def test_poses_are_those_of_predict_views_in_the_world(
+    estimator, stereo, shots, expected, track, warnings
+):
     worker = ViewsWorker(estimator, poses_of(stereo), "bench", track=track)
     answer = worker.process(*shots())
-    cameras = [stereo.K] * 2
-    (expected,) = estimator.predict_views(stereo.images, cameras, stereo.poses).detections
     (detection,) = answer.detections
     np.testing.assert_allclose(detection.T_world_obj, expected.T_world_obj, atol=1e-9)
     assert np.linalg.norm((detection.T_world_obj - stereo.T_world_obj)[:3, 3]) < 5e-4
