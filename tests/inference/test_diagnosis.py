@@ -150,8 +150,7 @@ def test_wrong_distance_range_is_reported(estimator, factory):
 def test_mesh_of_another_size_is_diagnosed_first(estimator, factory, factor, fix):
     mesh = replace(PART.mesh, vertices=factor * PART.mesh.vertices)
     image, K = np.zeros((128, 128, 3), np.uint8), factory.scene(0, 0).K
-    case = Case(estimator, image, K, [replace(estimator.parts[0], mesh=mesh)])
-    wrong = next(finding for finding in diagnose(case) if finding.fix)
+    wrong = CHECKS[0](Case(estimator, image, K, [replace(estimator.parts[0], mesh=mesh)]))
     assert wrong.subject == "part"
     assert f"{factor:.3g} times" in wrong.sentence
     assert fix in wrong.fix

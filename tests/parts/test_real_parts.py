@@ -1,4 +1,5 @@
 import shutil
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from tests.parts.makers import solid_of
 TEXTURED = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box",
             "010_potted_meat_can")  # fmt: skip
 GELATIN = "009_gelatin_box"
+loaded = cache(ycb_part)
 
 
 def test_stl_parts_agree_with_trimesh(shared_data):
@@ -31,7 +33,7 @@ def test_stl_parts_agree_with_trimesh(shared_data):
 
 @pytest.mark.parametrize("name", TEXTURED)
 def test_a_textured_model_agrees_with_trimesh(ycb_root, name):
-    part = ycb_part(ycb_root, name)
+    part = loaded(ycb_root, name)
     folder = ycb_root / "models" / name
     reference = trimesh.load_mesh(folder / "textured.obj", process=False)
     assert part.mesh.texture.shape == (1024, 1024, 3)
@@ -53,7 +55,7 @@ def test_every_ycb_object_has_all_its_points_and_a_sane_size(ycb_root):
     names = sorted(path.name for path in (ycb_root / "models").iterdir() if path.is_dir())
     assert len(names) == 21
     for name in names:
-        part = ycb_part(ycb_root, name)
+        part = loaded(ycb_root, name)
         points = np.loadtxt(ycb_root / "models" / name / "points.xyz")
         np.testing.assert_array_equal(part.points, points)
         assert (part.mesh is not None) == (name in TEXTURED)

@@ -1,4 +1,5 @@
 import math
+from functools import cache
 
 import cv2
 import numpy as np
@@ -34,19 +35,29 @@ FACING = make_transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 BLACK = np.zeros((480, 640, 3), np.uint8)
 
 
-@pytest.fixture(scope="module")
+BOX = make_part("box", mesh_of(trimesh.creation.box((0.164, 0.214, 0.072))))
+
+
+@pytest.fixture
 def box():
-    return make_part("box", mesh_of(trimesh.creation.box((0.164, 0.214, 0.072))))
+    return BOX
 
 
-def seen(part, T, wall=0.9):
+def seen(part, T):
     """Return image and noisy depth of a part before a wall."""
+    image, depth = rendered(part.name, tuple(T.ravel()))
+    return image.copy(), depth.copy()
+
+
+@cache
+def rendered(name, pose):
+    part, T = BOX if name == "box" else pivconnector(), np.reshape(pose, (4, 4))
     body = make_body(part, is_target=True)
-    objects, plane = (SceneObject(body.surface, T, part=part),), Plane((0.0, 0.0, -1.0), -wall)
-    rendered = render(Scene(K, np.full_like(BLACK, (40, 110, 60)), objects, plane=plane))
-    depth = rendered.depth
+    objects, plane = (SceneObject(body.surface, T, part=part),), Plane((0.0, 0.0, -1.0), -0.9)
+    shown = render(Scene(K, np.full_like(BLACK, (40, 110, 60)), objects, plane=plane))
+    depth = shown.depth
     noise = np.random.default_rng(0).normal(size=depth.shape)
-    return rendered.image, (depth + 1e-3 * noise * (depth > 0)).astype(np.float32)
+    return shown.image, (depth + 1e-3 * noise * (depth > 0)).astype(np.float32)
 
 
 def depth_of(part, T):
