@@ -80,56 +80,43 @@ def started(folder: Path) -> list[list[str]]:
     return [line.split() for line in lines]
 
 
-def test_a_repeated_command_continues_and_names_the_best_trial(call_fast, tmp_path):
-    assert call_fast(*FAST, "search.num_trials=1")[0] == 0
-    for _ in range(2):  # the second time, nothing is missing
-        code, out, err = call_fast(*FAST, "search.num_trials=2")
-        assert code == 0, err
-        assert [int(number) for number, _ in started(tmp_path)] == [0, 1]
-    result = trials(tmp_path)
-    assert [trial.state for trial in result] == [TrialState.COMPLETE] * 2
-    for trial, (number, lr) in zip(result, started(tmp_path), strict=True):
-        assert (tmp_path / "search" / "s" / number / "metrics.json").is_file()
-        assert trial.number == int(number)
-        assert trial.params["optimizer.lr"] == pytest.approx(float(lr), rel=1e-3)
-    drawn = {trial.params["optimizer.lr"] for trial in result}
-    assert len(drawn) == 2  # the second command drew new values
-    best = max(result, key=lambda trial: trial.value or 0)
-    assert f"best trial {best.number}, objective {best.value:.4f}: optimizer.lr=" in out
-    assert "study s: 2 complete" in out
+def test_a_study_goes_on_after_an_interruption_and_a_failure(call_fast, tmp_path, monkeypatch):
+    """The interrupted command ran two trials at a time, and the first has a result."""
+    command = (*FAST, "search.num_parallel=2")
 
+    def numbers() -> list[int]:
+        return [int(number) for number, _ in started(tmp_path)]
 
-def test_interrupted_trials_run_again_under_their_numbers(call_fast, tmp_path, monkeypatch):
-    monkeypatch.setenv("END_0", "interrupt")
-    assert call_fast(*FAST, "search.num_trials=2")[0] == 130
-    assert trials(tmp_path)[0].state == TrialState.RUNNING
-    drawn = trials(tmp_path)[0].params
-    done = call_fast(*FAST, "search.num_trials=2", code=0)
-    assert "continues with trials 0" in done.out
-    result = trials(tmp_path)
-    assert [trial.state for trial in result] == [TrialState.COMPLETE] * 2
-    assert result[0].params == drawn
-    assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1]
-
-
-def test_unreported_results_are_not_computed_again(call_fast, tmp_path):
-    """The command died after a job's end: here, one of two that run at a time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("END_1", "interrupt")
-        assert call_fast(*FAST, "search.num_trials=2", "search.num_parallel=2")[0] == 130
+    monkeypatch.setenv("END_1", "interrupt")
+    call_fast(*command, "search.num_trials=2", code=130)
     assert [trial.state for trial in trials(tmp_path)] == [TrialState.RUNNING] * 2
-    assert call_fast(*FAST, "search.num_trials=2", "search.num_parallel=2")[0] == 0
-    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 1]
-    assert [trial.state for trial in trials(tmp_path)] == [TrialState.COMPLETE] * 2
+    drawn = [trial.params for trial in trials(tmp_path)]
+    done = call_fast(*command, "search.num_trials=2", code=0)
+    assert "continues with trials 1" in done.out
+    assert numbers() == [0, 1, 1]  # the first result is not computed again
+    assert [trial.params for trial in trials(tmp_path)] == drawn
 
-
-def test_a_failing_trial_does_not_stop_the_study(call_fast, tmp_path, monkeypatch):
-    monkeypatch.setenv("END_0", "raise")
-    done = call_fast(*FAST, "search.num_trials=2", code=0)
-    assert "1 complete, 1 fail" in done.out
-    assert trials(tmp_path)[0].state == TrialState.FAIL
-    failed = json.loads((tmp_path / "search" / "s" / "0" / "failed.json").read_text())
+    monkeypatch.setenv("END_2", "raise")
+    for _ in range(2):  # the second time, nothing is missing
+        done = call_fast(*command, "search.num_trials=4", code=0)
+        assert numbers() == [0, 1, 1, 2, 3]
+    assert "study s: 3 complete, 1 fail" in done.out
+    result = trials(tmp_path)
+    assert result[2].state == TrialState.FAIL
+    failed = json.loads((tmp_path / "search" / "s" / "2" / "failed.json").read_text())
     assert failed["reason"] == "as the test asked"
+    rates = {int(number): float(lr) for number, lr in started(tmp_path)}
+    assert len(set(rates.values())) == 4
+    for trial in result:
+        assert trial.params["optimizer.lr"] == pytest.approx(rates[trial.number], rel=1e-3)
+    best = max((trial for trial in result if trial.value is not None), key=lambda t: t.value)
+    assert f"best trial {best.number}, objective {best.value:.4f}: optimizer.lr=" in done.out
+
+    # Another configuration or space is another study.
+    line = call_fast(*FAST, "search.num_trials=5", "data.batch_size=7").line
+    assert "data.batch_size=7, but data.batch_size=32 at the start of the study s" in line
+    done = call_fast(*SEARCH, "optimizer.lr=interval(1e-6,1e-5)", "search.prune=false")
+    assert "search.study=NAME" in done.line
 
 
 def test_trials_below_the_median_are_pruned(call_fast, tmp_path):
@@ -154,14 +141,6 @@ def test_trials_below_the_median_are_pruned(call_fast, tmp_path):
         assert record.is_file() == (trial.state == TrialState.PRUNED)
     record = tmp_path / "search" / "s" / str(pruned[0].number) / "pruned.json"
     assert "worse than the other trials' median" in json.loads(record.read_text())["reason"]
-
-
-def test_a_study_is_not_mixed_with_another_configuration(call_fast):
-    assert call_fast(*FAST, "search.num_trials=1")[0] == 0
-    line = call_fast(*FAST, "search.num_trials=2", "data.batch_size=7").line
-    assert "data.batch_size=7, but data.batch_size=32 at the start of the study s" in line
-    done = call_fast(*SEARCH, "optimizer.lr=interval(1e-6,1e-5)", "search.prune=false")
-    assert "search.study=NAME" in done.line
 
 
 def test_a_folder_of_another_study_or_command_is_rejected(call_fast, tmp_path):
