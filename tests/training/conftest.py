@@ -23,6 +23,7 @@ from dopepp.training.run_checkpoints import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
+from tests.data.makers import MadeSource
 
 INPUT_SIZE = (128, 128)
 NOISE_SIZE = 32
@@ -101,36 +102,18 @@ def batch(make_datamodule):
     return next(iter(make_datamodule().val_dataloader()))
 
 
-class Noise:
-    """A cheap source of images that differ in every epoch."""
-
-    name = "noise"
-
-    def __init__(self, num_images, part):
-        self.num_images, self.part = num_images, part
-
-    def __len__(self):
-        return self.num_images
-
-    def sample(self, index, epoch=0):
-        rng = np.random.default_rng([epoch, index])
-        image = rng.integers(0, 255, (NOISE_SIZE, NOISE_SIZE, 3), np.uint8)
-        keypoints = rng.uniform(0, NOISE_SIZE, (9, 2))
-        return Sample(image, np.eye(3), [Instance(self.part.name, np.eye(4), keypoints)])
-
-    def describe(self):
-        return []
-
-    def contains(self, label):
-        return True
-
-
 @pytest.fixture(scope="session")
 def make_noise(part):
     """Eight training and four validation images of noise in batches of two."""
 
+    def sample(index, epoch):
+        rng = np.random.default_rng([epoch, index])
+        image = rng.integers(0, 255, (NOISE_SIZE, NOISE_SIZE, 3), np.uint8)
+        keypoints = rng.uniform(0, NOISE_SIZE, (9, 2))
+        return Sample(image, np.eye(3), [Instance(part.name, np.eye(4), keypoints)])
+
     def make():
-        sources = [Noise(number, part) for number in (8, 4, 1)]
+        sources = [MadeSource(sample, number, part.name) for number in (8, 4, 1)]
         return PoseDataModule(*sources, [part.name], (NOISE_SIZE, NOISE_SIZE), batch_size=2)
 
     return make

@@ -47,7 +47,7 @@ def images(part):
 
 
 @pytest.fixture
-def measure(monkeypatch, make_trainer, make_system, make_datamodule, images, tmp_path):
+def measure(monkeypatch, make_trainer, make_system, make_noise, images, tmp_path):
     """Fit with a measurement after every validation; return the callback, trainer and estimator."""
 
     def measure(wrong, epochs=1, **options):
@@ -55,7 +55,7 @@ def measure(monkeypatch, make_trainer, make_system, make_datamodule, images, tmp
         monkeypatch.setattr(RefinedProgress, "_estimator", lambda self, system: known)
         progress = RefinedProgress(images, "region", **options)
         trainer = make_trainer(tmp_path, [progress], max_epochs=epochs)
-        trainer.fit(make_system(), make_datamodule())
+        trainer.fit(make_system(), make_noise())
         return progress, trainer, known
 
     return measure
