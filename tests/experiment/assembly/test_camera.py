@@ -33,7 +33,7 @@ camera_matrix: !!opencv-matrix
    data: [ {FOCAL}, 0., 640., 0., {FOCAL}, 360., 0., 0., 1. ]
 """
 SMALL = ("data.samples_per_epoch=8", "data.batch_size=4", "data.num_val=2", "data.num_test=1",
-         "data.cache=none", "data.num_workers=0")  # fmt: skip
+         "data.cache=none", "data.num_workers=0", "data.symmetries=none")  # fmt: skip
 
 
 @pytest.fixture

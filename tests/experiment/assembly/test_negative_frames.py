@@ -20,6 +20,8 @@ from dopepp.experiment.assembly.negative_frames import (
 from dopepp.experiment.assembly.photos import held_out_photos, training_backgrounds
 from dopepp.experiment.run.resume import describe_images, differing_images
 
+pytestmark = pytest.mark.usefixtures("quick_sky")
+
 
 @pytest.fixture
 def photos(tmp_path, monkeypatch):
@@ -113,10 +115,8 @@ def test_changed_photos_change_the_described_images(tiny, photos):
 
 
 def test_too_few_photos_are_rejected(tiny, photos):
-    for number in range(6, 12):
+    for number in range(5, 12):
         (photos / f"{number}.png").unlink()
-    assert len(frames(tiny("virtual.backgrounds=./photos"), "val")) == 6
-    (photos / "0.png").unlink()
     with pytest.raises(UserError, match=r"with 5 photos, .*at least 6 different"):
         frames(tiny("virtual.backgrounds=./photos"), "val")
 

@@ -35,7 +35,7 @@ def test_progress_is_measured_on_whole_images(tiny, tmp_path):
         "data: [300, 0, 159.5, 0, 300, 119.5, 0, 0, 1]}\n"
     )
     seen = ("experiment=my_part", f"virtual.camera={camera}", "virtual.working_distance=[0.3,0.5]")
-    config = tiny(*seen, "data.input_size=[128,128]")
+    config = tiny(*seen, "data.input_size=[128,128]", "data.symmetries=none")
     data = fit_to_camera(config, parts := build_parts(config.data)).data
     datamodule = build_datamodule(data, parts, config.seed)
     (progress,) = _progress(config, datamodule)
