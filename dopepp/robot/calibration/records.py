@@ -198,8 +198,8 @@ def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
     Names match with or without suffix; poses without names match by order.
 
     Raises:
-        UserError: A pose names an image that does not exist, or there are no names and the numbers
-            of poses and images differ.
+        UserError: A pose names an image that does not exist, two poses name one image, or there
+            are no names and the numbers of poses and images differ.
     """
     if any(poses.names):
         full_names = {name: name for name in images}
@@ -213,7 +213,13 @@ def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:
                 "set the name of each pose to the file name of its image, or pass the folder with "
                 "these images",
             )
-        return {full_names[name]: row for row, name in enumerate(poses.names)}
+        rows = {full_names[name]: row for row, name in enumerate(poses.names)}
+        if len(rows) < len(poses.names):
+            used = [full_names[name] for name in poses.names]
+            repeated = next(name for name in used if used.count(name) > 1)
+            problem = f"{poses.source}: {used.count(repeated)} poses of the image {repeated}"
+            raise UserError(problem, "one pose for every image", "delete the wrong poses")
+        return rows
     if len(poses.names) != len(images):
         problem = f"{len(poses.names)} poses and {len(images)} images"
         fix = "add a column `name` with the image of every pose"

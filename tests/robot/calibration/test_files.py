@@ -79,6 +79,9 @@ def test_poses_are_paired_with_their_images(tmp_path):
     assert pairs == {"b.png": 0, "a.png": 1}
     with pytest.raises(UserError, match="the first 'b'"):
         match_images(read_robot_poses(path), ["a.png"])
+    path.write_text("image,x,y,z,rx,ry,rz\nb,1,2,3,0,0,0\nb.png,4,5,6,0,0,0\n")
+    with pytest.raises(UserError, match=r"2 poses of the image b\.png"):
+        match_images(read_robot_poses(path), ["a.png", "b.png"])
     path.write_text("x,y,z,rx,ry,rz\n1,2,3,0,0,0\n")
     assert match_images(read_robot_poses(path), ["a.png"]) == {"a.png": 0}
     with pytest.raises(UserError, match="1 poses and 2 images"):
