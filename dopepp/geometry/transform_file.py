@@ -50,8 +50,13 @@ def read_transform(path: Path, name: str, tolerance: float = EXACT) -> Transform
         UserError: The file cannot be read, or has no rigid transform of this name.
     """
     content = read_yaml(path)
-    value = content.get(name) if isinstance(content, Mapping) else None
-    return parse_transform(value, f"{path}: {name}", tolerance)
+    fields = content if isinstance(content, Mapping) else {}
+    if name not in fields:
+        problem = f"{path} with the fields {', '.join(map(str, fields)) or 'none'!s:.200}"
+        mount = "hand" if name == "T_flange_cam" else "bench"
+        fix = f"pass a file from `dopepp calibrate handeye --mount {mount}`"
+        raise UserError(problem, f"a file with {name}", fix)
+    return parse_transform(fields[name], f"{path}: {name}", tolerance)
 
 
 def parse_transform(value: object, where: str, tolerance: float = ROUNDED) -> Transform:

@@ -51,6 +51,8 @@ def test_matrices_of_calibrations_must_be_exact(tmp_path):
     with pytest.raises(UserError, match=r"hand_eye\.yaml: T_flange_cam"):
         read_transform(path, "T_flange_cam")
     assert_allclose(read_transform(path, "T_flange_cam", ROUNDED), T_WORLD_CAM, atol=2e-4)
+    with pytest.raises(UserError, match=r"the fields T_flange_cam;.* --mount bench"):
+        read_transform(path, "T_base_cam")
 
 
 def test_camera_of_all_views_or_of_a_single_view(tmp_path):
