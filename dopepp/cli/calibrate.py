@@ -233,7 +233,9 @@ def rig(
 
     check_target(out, (".yaml", ".yml"))
     target = parse_board(board)
-    T_base_first = np.eye(4) if hand_eye is None else read_transform(hand_eye, "T_base_cam")
+    T_base_first, doubts = np.eye(4), list[str]()
+    if hand_eye is not None:
+        T_base_first, doubts = read_transform(hand_eye, "T_base_cam"), _doubts(hand_eye)
     boards, cameras = {}, {}
     for images in sorted(path for path in folder.glob("*") if path.is_dir()):
         detections, size = detect_in_folder(images, target)
@@ -252,7 +254,7 @@ def rig(
         for number, name in enumerate(calibration.names)
     }
     record = {"camera_error": [float(shift), float(np.degrees(rotation))], "views": views}
-    write_calibration(out, "rig", record, calibration.findings, force)
+    write_calibration(out, "rig", record, [*calibration.findings, *doubts], force)
     typer.echo(f"written: {out}")
 
 
@@ -304,9 +306,16 @@ def _bench_from_board(
         T_base_cam = {name: flanges[row] @ T_mount_cam for name, row in rows.items()}
     used = [name for name in boards if name in T_base_cam]
     bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], parse_board(spec))
-    if record.get("trusted") is not True:
-        bench = replace(bench, findings=(*bench.findings, f"{hand_eye} is not trusted"))
-    return bench, used
+    return replace(bench, findings=(*bench.findings, *_doubts(hand_eye))), used
+
+
+def _doubts(hand_eye: Path) -> list[str]:
+    """Return the finding that a hand-eye file is not trusted, if it is not."""
+    from dopepp.core.yaml import read_yaml
+
+    content = read_yaml(hand_eye)
+    is_trusted = isinstance(content, dict) and content.get("trusted") is True
+    return [] if is_trusted else [f"{hand_eye} is not trusted"]
 
 
 def _show_lens(calibration: LensCalibration) -> None:

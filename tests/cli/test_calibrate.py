@@ -185,6 +185,14 @@ def test_a_rig_is_calibrated_for_several_views(run, rig_folder, tmp_path):
     assert 1e-6 < poses.error[0] < 1e-3
 
 
+def test_a_rig_is_not_trusted_if_its_hand_eye_file_is_not(refused, rig_folder, tmp_path):
+    doubtful, out = tmp_path / "hand_eye.yaml", tmp_path / "rig.yaml"
+    record = {"T_base_cam": transform_record(np.eye(4))}
+    write_calibration(doubtful, "hand-eye", record, ["few poses"], True)
+    words = ("--board", SPEC, "--hand-eye", doubtful, "--out", out)
+    assert f"{doubtful} is not trusted" in refused("calibrate", "rig", rig_folder[0], *words)
+
+
 def test_the_error_of_a_faulty_rig_names_the_camera(run, refused, rig_folder, tmp_path):
     rig, out = tmp_path / "rig", tmp_path / "rig.yaml"
     shutil.copytree(rig_folder[0], rig)
