@@ -46,6 +46,7 @@ def send_lines(
     """
     with nullcontext(_print) if address is None else _datagrams(address) as send:
         for source, camera in sources:
+            worker.restart()
             for frame in source.frames():
                 send(worker.result(frame, camera).to_json())
 

@@ -83,6 +83,7 @@ class ViewsWorker(Worker):
             self._warn("finding", finding)
         return self._answer(views[0].stamp, self.world, result)
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Begin the tracking anew."""
         if self._views_tracker is not None:
             self._views_tracker = ViewsTracker(self._estimator(True))

@@ -243,9 +243,10 @@ class Worker:
                 f"stamps on {topic} went back by {decrease_s:.3f} s: a restarted recording or "
                 "simulation, or two cameras on one topic? Parts are detected again",
             )
-            self._restart()
+            self.restart()
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Begin the tracking anew, e.g. for the images of another camera."""
         if self._tracker is not None:
             self._tracker = PoseTracker(self._estimator(True))
 

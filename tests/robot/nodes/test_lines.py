@@ -6,6 +6,11 @@ import socket
 import numpy as np
 import pytest
 
+from dopepp.geometry.camera_file import Camera
+from dopepp.inference.frames.media import Images
+from dopepp.robot.nodes.standalone import send_lines
+from dopepp.robot.nodes.worker import Worker
+
 MODEL = "pretrained/pivconnector"
 
 
@@ -23,6 +28,14 @@ def test_lines_hold_the_poses_of_the_estimator(run, camera, intrinsics, estimato
         assert len(line["detections"]) == len(expected)
         for record, T in zip(line["detections"], expected, strict=True):
             np.testing.assert_allclose(record["T_cam_obj"], T, atol=1e-9)
+
+
+def test_each_source_is_tracked_alone(camera, estimator, capsys):
+    source = Images([camera.folder / "0.png"]), Camera(None, camera.K, (), "K")
+    send_lines(Worker(estimator, track=True), [source, source])
+    first, second = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert first["detections"] == second["detections"] != []
+    assert second["speed_ms"]["network"] > 0  # the part is detected again
 
 
 def test_each_datagram_holds_a_line(run, camera, intrinsics):
