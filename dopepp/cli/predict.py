@@ -190,9 +190,10 @@ def _predict_source(
         reason = ""
         if not result.detections and source.rate is None and not options["track"]:
             result, reason = _search_again(estimator, camera, options, result)
-        for record, detection in zip(result.records(), result.detections, strict=True):
-            if verification is not None:
-                record["agreement"] = verification(result, detection)
+        if verification is not None:
+            agreements = [verification(result, detection) for detection in result.detections]
+            result = replace(result, agreements=agreements)
+        for record in result.records():
             typer.echo(json.dumps(record, ensure_ascii=False))
         summary = result.summary
         if result.weaker:

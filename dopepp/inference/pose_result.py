@@ -104,6 +104,7 @@ class PoseResult:
     shapes: Mapping[str, Shape] = field(default_factory=dict, repr=False)  # by part name
     weaker: Sequence[float] = ()  # scores of the candidates below min_score, best first
     min_score: float = 0.0  # minimum score of a detection
+    agreements: Sequence[float] | None = None  # of each drawn part with the image; None: not asked
 
     @property
     def num_weaker(self) -> int:
@@ -150,10 +151,14 @@ class PoseResult:
         shared: dict[str, Any] = {"image": self.name, "number": self.number}
         if self.time is not None:
             shared["time"] = self.time
-        return [
+        records = [
             {**shared, **({} if identity is None else {"identity": identity}), **record(detection)}
             for detection, identity in self._identified()
         ]
+        if self.agreements is None:
+            return records
+        pairs = zip(records, self.agreements, strict=True)
+        return [{**row, "agreement": agreement} for row, agreement in pairs]
 
     def to_json(self) -> str:
         """Return image name, K, speed, weaker candidates and all detections as a line of JSON."""

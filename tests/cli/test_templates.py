@@ -43,7 +43,8 @@ def test_predict_draws_and_writes_the_pose_of_a_mesh(run, truth, tmp_path):
     assert line["score"] > line["probability"] > 0.5  # scores have a silent level of 0
     assert line["agreement"] > 0.5
     assert len(list((tmp_path / "out").iterdir())) == 1
-    assert json.loads((tmp_path / "p.json").read_text())
+    (written,) = json.loads((tmp_path / "p.json").read_text())["detections"]
+    assert written["agreement"] == line["agreement"]
     assert (tmp_path / "p.csv").read_text().count("\n") == 2
 
 
