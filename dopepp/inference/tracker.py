@@ -40,8 +40,8 @@ MAX_DISAGREEMENTS: Final = 2  # consecutive disagreeing detections after which a
 # Share of the usual agreement below which a track is doubtful. On rendered sequences, the share was
 # 0.97 at correct poses, and 0.5 at poses that an occluder had displaced.
 MIN_USUAL_SHARE: Final = 0.8
-# Agreement below which a pose is rejected (unless the first pose agreed less): half of a wrong
-# pose's outline may coincide with other edges.
+# Agreement below which a pose of a tracked part is rejected (unless the first pose agreed less):
+# half of a wrong pose's outline may coincide with other edges.
 MIN_AGREEMENT: Final = 0.6
 CERTAIN: Final = 0.85  # agreement below which the network is run every CHECK_EVERY frames
 CHECK_EVERY: Final = 5
@@ -203,9 +203,11 @@ class Tracker(ABC, Generic[Item]):
                 self._states.append(_State(identity, detected, motion, detected.agreement))
                 continue
             tracked = state.estimate
-            if detected.agreement < min(MIN_AGREEMENT, state.usual):
+            if state.unseen:
+                state.move_to(detected, motion)
+            elif detected.agreement < min(MIN_AGREEMENT, state.usual):
                 continue
-            if state.unseen or (state.doubts and detected.agreement > tracked.agreement):
+            elif state.doubts and detected.agreement > tracked.agreement:
                 state.move_to(detected, motion)
             elif self._keypoint_distance(tracked, detected) <= MAX_ERROR:
                 state.disagreements = 0

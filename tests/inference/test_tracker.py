@@ -131,6 +131,13 @@ def test_lost_part_is_searched_and_keeps_its_identity(stage, tracker):
     assert stage.looks == 9
 
 
+def test_lost_part_is_reported_when_the_network_detects_it(stage, tracker):
+    stage.put("a", (0.1, 0.0, 0.3))
+    stage.network_agreement = 0.5  # as blurred edges
+    (track,) = tracker.track(IMAGE, K)
+    assert (track.identity, track.detected) == (0, True)
+
+
 def test_only_parts_above_the_threshold_are_tracked(stage):
     stage.put("a", (0.0, 0.0, 0.3))
     stage.min_score = 0.95
