@@ -59,6 +59,7 @@ class Viewer:
         self._recording = rr.RecordingStream("dopepp")
         self._shown: set[str] = set()
         self._is_open = False
+        self._first = self._next = 0  # frame number at which a source starts on the timeline
         if path is not None:
             check_target(path, (".rrd",))
         elif sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
@@ -66,7 +67,8 @@ class Viewer:
             raise UserError("--show without a display", "a desktop session", fix)
 
     def begin(self, source: FrameSource) -> None:
-        """Do nothing: the frames of another source continue on the same timeline."""
+        """Place the frames of the source after those of the previous source on the timeline."""
+        self._first = self._next
 
     def write(self, result: PoseResult) -> None:
         """Add a frame: its image, outlines, belief maps and poses."""
@@ -75,7 +77,9 @@ class Viewer:
         log, distance = self._recording.log, self._distance(result)
         if not self._is_open:
             self._open(distance)
-        self._recording.set_time("frame", sequence=result.number)
+        number = self._first + result.number
+        self._next = number + 1
+        self._recording.set_time("frame", sequence=number)
         if result.time is not None:
             kind = "timestamp" if result.time > SINCE_1970 else "duration"
             self._recording.set_time("time", **{kind: result.time})

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.inference.frames.media import Images
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.viewer import Viewer, belief_images
 
@@ -42,6 +43,19 @@ def test_recording_contains_every_entity(estimator, result, tmp_path):
         f"/world/uncertainty/{name}",
     }  # fmt: skip
     assert {name for chunk in chunks for name in chunk.timeline_names} >= {"frame", "time"}
+
+
+def test_frames_of_the_next_source_follow_on_the_timeline(estimator, result, tmp_path):
+    path = tmp_path / "out.rrd"
+    viewer = Viewer(estimator, path)
+    for _ in range(2):
+        viewer.begin(Images([tmp_path / "any.png"]))
+        viewer.write(result)
+    viewer.close()
+    chunks = rerun.chunk.RrdReader(path).stream().to_chunks()
+    shown = [chunk for chunk in chunks if chunk.entity_path == "/summary"]
+    frames = [row["frame"] for chunk in shown for row in chunk.to_record_batch().to_pylist()]
+    assert sorted(frames) == [3, 7]
 
 
 def test_beliefs_peak_where_the_part_is(estimator, result):
