@@ -26,6 +26,7 @@ from dopepp.experiment.results.false_alarms import alarm_rows
 from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, read_json
 from dopepp.experiment.results.frame import markdown, shown_rows
 from dopepp.experiment.results.report import Report
+from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS, PoseRow, shown_columns
 from dopepp.models.checkpoint import SUFFIX, read, write_content
 from dopepp.training.pose_validation import best_effort
@@ -214,12 +215,19 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
     """Write the weights ``NAME.safetensors`` and the model card ``NAME.md``; return both paths.
 
     ``results`` is the ``metrics.json`` of a run or an evaluation of the checkpoint.
+
+    Raises:
+        UserError: The name is invalid, the results are of other parts, or the network is too large.
     """
     if not name.isidentifier():
         allowed = "letters, digits and _, not starting with a digit"
         raise UserError(f"release name {name!r}", allowed, "choose a name such as my_part")
     trained = read(checkpoint)
     report = Report.from_record(read_json(results))
+    names = [part.name for part in trained.parts]
+    if others := ", ".join(part for part in report.rows if part not in (*names, MEAN)):
+        allowed, fix = f"results of {', '.join(names)}", "pass the metrics.json of this run"
+        raise UserError(f"{results} with results of {others}", allowed, fix)
     parameters = sum(value.numel() for value in trained.state_dict.values())
     if 2 * parameters > MAX_BYTES:
         raise UserError(

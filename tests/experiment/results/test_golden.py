@@ -343,7 +343,8 @@ def test_readme_of_a_run(report, compare_golden):
 def released(tiny_spec, tmp_path):
     """Release a checkpoint with the report of its run."""
 
-    def make(name="bracket", checkpoint="best.ckpt", metrics="metrics.json", refined=None):
+    def make(name="bracket", checkpoint="best.ckpt", metrics="metrics.json", refined=None,
+             part="pivconnector"):  # fmt: skip
         torch.manual_seed(0)
         config = {
             "virtual": {"preset": "wide"},
@@ -351,7 +352,7 @@ def released(tiny_spec, tmp_path):
             "cache_dir": "/x/y",
         }
         content = Checkpoint(
-            tiny_spec, build_network(tiny_spec).state_dict(), [load_part("pivconnector")],
+            tiny_spec, build_network(tiny_spec).state_dict(), [load_part(part)],
             (64, 48), 8, 1.0, data={"name": "dopepp", "config": config},
         )  # fmt: skip
         write_atomic(content.to_file(), tmp_path / "best.ckpt")
@@ -400,6 +401,7 @@ def test_the_card_of_a_release(is_refined, released, compare_golden):
     ({"name": "../x"}, r"name '\.\./x'; allowed: letters"),
     ({"metrics": "other.json"}, r"other\.json"),
     ({"checkpoint": "other.ckpt"}, r"other\.ckpt"),
+    ({"part": "servoholder"}, "results of pivconnector; allowed: results of servoholder"),
     ({}, "of weights in half precision; allowed: at most 100"),
 ], ids=str)  # fmt: skip
 def test_rejected_releases(change, message, released, tmp_path, monkeypatch):
