@@ -109,7 +109,7 @@ def plausible_camera(
     if shape is None:
         return K
     try:
-        check_camera(K, shape[::-1], "this image")
+        check_camera(K, shape[::-1], "the data set")
     except UserError as error:
         node.report(error.got, error.allowed)
         return None
