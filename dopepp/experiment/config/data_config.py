@@ -29,6 +29,14 @@ Side = Annotated[int, Range(8, 16384)]
 
 _MULTIPLE: Final = 32  # both sides of the network's input are multiples of this number of pixels
 
+AUTOMATIC: Final = (
+    ("data", "input_size"),
+    ("virtual", "camera_scale"),
+    ("virtual", "camera"),
+    ("virtual", "working_distance"),
+)
+"""Nodes and options whose default (null) a run replaces by a value that suits its objects."""
+
 # Nodes to which an evaluation cannot add options.
 _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_sets")
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
+from dopepp.experiment.config.data_config import AUTOMATIC
 from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
@@ -38,9 +39,6 @@ _HYDRA: Final = ".hydra"
 # Options of locations, devices and further measurements, which do not affect the result.
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
 _BESIDE: Final = ("shading", "scale_factors", "by", "num_bins", "bop_csv", "all_measures")
-
-# Options whose default (null) is replaced by a value that suits the sizes of the objects.
-_CHOSEN_SIZES: Final = (("data", "input_size"), ("virtual", "camera_scale"))
 
 _LONGEST_NAME: Final = 60  # maximum length of a method's name in tables and legends
 
@@ -141,13 +139,13 @@ def read_run(folder: Path) -> Run:
         run.failure = str(error)
     if run.report is not None and "checkpoint" in run.report.details:
         run.checkpoint = folder / str(run.report.details["checkpoint"])
-    training, configs = config, [_without_automatic_sizes(folder, config)] if config else []
+    training, configs = config, [_without_automatic_values(folder, config)] if config else []
     if "ckpt_path" in config:  # an evaluation: its checkpoint belongs to a training run
         run.checkpoint = Path(str(config["ckpt_path"]))
         trained = run.checkpoint.parent.parent
         training = _mapping(trained / CONFIG_FILE)
         run.overrides = [*overrides_of(trained), *run.overrides]
-        configs = [config, _without_automatic_sizes(trained, training)] if training else []
+        configs = [config, _without_automatic_values(trained, training)] if training else []
     seed = training.get("seed")
     run.seed = seed if isinstance(seed, int) else None
     run.recipe = _recipe(configs)
@@ -164,10 +162,10 @@ def _model(config: Mapping[str, Any], run: Run) -> str:
     return chosen[-1] if chosen else "run" if run.report is None else run.report.name
 
 
-def _without_automatic_sizes(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's config with None for an automatic input size or camera scale."""
+def _without_automatic_values(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's config with None for the options of :data:`AUTOMATIC` that were not set."""
     composed, result = _mapping(folder / _HYDRA / "config.yaml"), dict(config)
-    for node, name in _CHOSEN_SIZES:
+    for node, name in AUTOMATIC:
         is_automatic = (composed.get(node) or {}).get(name, name) is None
         if is_automatic and isinstance(result.get(node), dict):
             result[node] = {**result[node], name: None}

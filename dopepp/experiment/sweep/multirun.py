@@ -135,7 +135,13 @@ def _redirect(targets: list[int]) -> None:
 
 
 def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
-    """Return whether the folder holds the last checkpoint of a run with the same config."""
+    """Return whether the folder holds the last checkpoint of a run with the same config.
+
+    The stored config holds the camera's values instead of its file, and the values that the run
+    has chosen; the checks of resuming compare these values again.
+    """
+    from dopepp.experiment.config.data_config import AUTOMATIC, with_files
+    from dopepp.experiment.config.run_config import is_below
     from dopepp.experiment.results.folder import CONFIG_FILE, LAST_CHECKPOINT
     from dopepp.experiment.run.resume import config_differences
 
@@ -145,7 +151,14 @@ def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
     if not (run_dir / LAST_CHECKPOINT).is_file():
         return False
     before = read_yaml(stored)
-    return isinstance(before, dict) and not config_differences(before, config)
+    if not isinstance(before, dict):
+        return False
+    present = {**config, "virtual": with_files(config.get("virtual"))}
+    chosen = [
+        f"{node}.{name}" for node, name in AUTOMATIC if not (present.get(node) or {}).get(name)
+    ]
+    changes = config_differences(before, present)
+    return all(is_below(change.key, chosen) for change in changes)
 
 
 def job_id() -> str | None:

@@ -130,13 +130,14 @@ def test_networks_of_single_parts_are_joined_with_a_mean():
 # Run folders
 
 
-@pytest.mark.parametrize(("camera_scale", "count", "objects"), [(None, 1, 3), (0.5, 2, 1)])
-def test_an_automatic_scale_keeps_the_recipe(camera_scale, count, objects, tmp_path):
-    for part, scale in (("bolt", 0.5), ("nut", 0.9)):
-        config = {"data": {"objects": [part]}, "virtual": {"camera_scale": scale}}
+@pytest.mark.parametrize("option", ["camera_scale", "working_distance"])
+@pytest.mark.parametrize(("given_value", "count", "objects"), [(None, 1, 3), (0.5, 2, 1)])
+def test_an_automatic_value_keeps_the_recipe(option, given_value, count, objects, tmp_path):
+    for part, value in (("bolt", 0.5), ("nut", 0.9)):
+        config = {"data": {"objects": [part]}, "virtual": {option: value}}
         result = report_of("x", {part: GOOD})
         folder = write_run(tmp_path / part, [f"data.objects=[{part}]"], result, **config)
-        given = {"virtual": {"camera_scale": camera_scale}}
+        given = {"virtual": {option: given_value}}
         (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(given))
     entries = group(find_runs([tmp_path / "bolt", tmp_path / "nut"]))
     assert (len(entries), len(entries[0].objects)) == (count, objects)

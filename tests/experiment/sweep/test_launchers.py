@@ -162,6 +162,18 @@ def test_a_job_resumes_only_with_an_equal_config(tmp_path):
     assert not multirun.can_resume({**config, "resume": "outputs/y"}, tmp_path)
 
 
+def test_a_job_with_automatic_values_resumes(tmp_path):
+    (tmp_path / LAST_CHECKPOINT).parent.mkdir()
+    (tmp_path / LAST_CHECKPOINT).touch()
+    camera = tmp_path / "camera.json"
+    lens = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0}
+    camera.write_text(json.dumps(lens))
+    config = {"data": {"input_size": None}, "virtual": {"camera": str(camera)}}
+    write_config(tmp_path, {"data": {"input_size": [96, 96]}, "virtual": {"camera": lens}})
+    assert multirun.can_resume(config, tmp_path)
+    assert not multirun.can_resume({**config, "data": {"input_size": [64, 64]}}, tmp_path)
+
+
 def test_output_of_child_processes_is_redirected(tmp_path, capfd):
     with multirun.redirected_output(tmp_path / "job" / "job.log"):
         os.write(1, b"by this process\n")
