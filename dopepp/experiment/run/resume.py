@@ -2,8 +2,9 @@
 
 Every difference between the stored and the present config is reported. Options that affect
 learning (:data:`LEARNT_FROM`) and the images may change only with ``resume_anyway=true``. The
-network and the kind of optimiser must not change, because the saved state would not fit. All other
-options may change, such as the duration, the device and the callbacks.
+network and the kind of optimiser must not change, because the saved state would not fit, nor the
+initial weights, which would have no effect. All other options may change, such as the duration, the
+device and the callbacks.
 
 Files, meshes or the rendering code may change while the options stay the same. Therefore a
 checkpoint describes the sources and the first image of every split: its labels and an image of
@@ -78,8 +79,8 @@ def check_resume(
     """Return the accepted differences between a run and the config that resumes it.
 
     ``saved`` is the last checkpoint of the run, ``payload`` the description of a checkpoint of the
-    present config. A UserError is raised if the network or the kind of optimiser differs, or the
-    data or the loss without ``resume_anyway``.
+    present config. A UserError is raised if the network, the kind of optimiser or ``init_from``
+    differs, or the data or the loss without ``resume_anyway``.
     """
     path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
@@ -99,6 +100,12 @@ def check_resume(
             "the model, the number of objects and the optimiser of the interrupted run",
             "restore these options, or start a new run with "
             f"init_from={run / BEST_CHECKPOINT} if the network is the same",
+        )
+    if initial := [change for change in differences if change.key == "init_from"]:
+        raise UserError(
+            f"resume={run} with other initial weights ({_listed(initial)})",
+            "init_from of the interrupted run, which continues with its own weights",
+            "leave out init_from, or start a new run without resume",
         )
     learnt = [change for change in differences if is_below(change.key, LEARNT_FROM)]
     learnt = [change for change in learnt if not is_below(change.key, _NOT_LEARNT_FROM)]

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import signal
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,15 +45,11 @@ from dopepp.experiment.results.recording import measure_and_record, refining
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.evaluate import tune_and_record
 from dopepp.experiment.run.lr_finder import find_learning_rate
-from dopepp.experiment.run.resume import (
-    ConfigDifference,
-    check_resume,
-    describe_images,
-    remember_overrides,
-)
+from dopepp.experiment.run.resume import check_resume, describe_images, remember_overrides
 from dopepp.experiment.run.tracking import log_report, open_trackers
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import refine_terms
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Parts
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
@@ -144,8 +141,11 @@ def _train(
     sources = {"train": datamodule.train_source, "val": datamodule.val_source}
     sources["test"] = datamodule.test_source
     images = {split: describe_images(source) for split, source in sources.items()}
-    system = build_system(config, parts, fingerprint, images, datamodule.size_ranges(parts))
-    resume_from, changes = _resume_path(config, system)
+    newest = _newest_checkpoint(config)
+    # The file with the initial weights of a resumed run may no longer exist.
+    initial = config if newest is None else replace(config, init_from=None)
+    system = build_system(initial, parts, fingerprint, images, datamodule.size_ranges(parts))
+    changes = [] if newest is None else check_resume(run_dir, config, newest[1], system.payload)
     # Lightning may reject the options, so the trainer is built before anything is written.
     trainer = build_trainer(config, run_dir, trackers, _progress(config, datamodule))
     weights = system.network.state_dict().values()
@@ -164,7 +164,7 @@ def _train(
     display.show_sources(datamodule.summary())
     for line in template_commands(config.data):
         display.console.print(f"available now, without training: {line}", soft_wrap=True)
-    _fit(trainer, system, datamodule, resume_from, run_dir)
+    _fit(trainer, system, datamodule, None if newest is None else newest[0], run_dir)
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:
         raise SystemExit(0)  # only rank 0 measures and reports
@@ -243,10 +243,8 @@ def template_commands(data: DataConfig) -> list[str]:
     ]
 
 
-def _resume_path(
-    config: RunConfig, system: PoseSystem
-) -> tuple[Path | None, list[ConfigDifference]]:
-    """Return the checkpoint to resume from, or None, and the accepted changes of the config."""
+def _newest_checkpoint(config: RunConfig) -> tuple[Path, Checkpoint] | None:
+    """Return the checkpoint to resume from; None for a run that starts from its beginning."""
     resume = config.resume
     if resume is None:
         if config.resume_anyway:
@@ -254,7 +252,7 @@ def _resume_path(
             raise UserError(
                 "resume_anyway=true without resume", "both options, or resume alone", fix
             )
-        return None, []
+        return None
     run_dir = Path(resume)
     newest = newest_checkpoint(run_dir)
     if newest is None and not (run_dir / OVERRIDES_FILE).is_file():
@@ -265,9 +263,7 @@ def _resume_path(
         )
     if newest is None:
         display.console.print(f"no checkpoint yet in {resume}: the run starts from its beginning")
-        return None, []
-    path, checkpoint = newest
-    return path, check_resume(run_dir, config, checkpoint, system.payload)
+    return newest
 
 
 def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:

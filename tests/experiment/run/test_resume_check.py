@@ -164,6 +164,8 @@ def test_another_network_or_optimiser_is_always_rejected(anyway, resumed):
         resumed(f"resume_anyway={anyway}", spec="b")
     with pytest.raises(UserError, match=r"another optimiser \(optimizer\._target_: .*Muon → .*SGD"):
         resumed("optimizer=sgd", f"resume_anyway={anyway}")
+    with pytest.raises(UserError, match=r"other initial weights \(init_from: None → a\.ckpt\)"):
+        resumed("init_from=a.ckpt", f"resume_anyway={anyway}")
 
 
 def test_a_run_without_config_is_compared_by_its_checkpoint(resumed, tmp_path):
