@@ -59,6 +59,9 @@ _THIS_CALL: Final = ("resume", "resume_anyway", "output_dir")
 _NETWORK: Final = ("model.backbone", "model.attention", "model.head", "model.width")
 _OPTIMIZER: Final = "optimizer._target_"
 
+# A trial of a search is resumed by itself, because only the search knows the trial's number.
+_DROPPED: Final = ("resume", "resume_anyway", "hydra.run.dir", "search", "callbacks.trial")
+
 _ABSENT: Final = "not set"
 _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re.DOTALL)
 
@@ -142,7 +145,7 @@ def image_differences(saved: object, present: object) -> list[ConfigDifference]:
 
 
 def trusted_overrides(stored: object, source: Path) -> list[str]:
-    """Return the overrides of a run, except those that resume it or select its folder.
+    """Return the overrides of a run, except those of its folder, of resuming and of a search.
 
     A run folder is not trusted. Hydra's flags and nodes could execute arbitrary code, so they are
     not read from a folder.
@@ -154,7 +157,7 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
         if match is None:
             fix = "restore the file from backup, or start a new run"
             raise UserError(f"{source} with {text!r:.100}", "a list of overrides key=value", fix)
-        if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
+        if is_below(match["key"], _DROPPED):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
             _log.warning(

@@ -138,7 +138,8 @@ def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
     """Return whether the folder holds the last checkpoint of a run with the same config.
 
     The stored config holds the camera's values instead of its file, and the values that the run
-    has chosen; the checks of resuming compare these values again.
+    has chosen; the checks of resuming compare these values again. A trial that was resumed by
+    itself has stored no options of the search.
     """
     from dopepp.experiment.config.data_config import AUTOMATIC, with_files
     from dopepp.experiment.config.run_config import is_below
@@ -154,11 +155,11 @@ def can_resume(config: Mapping[str, Any], run_dir: Path) -> bool:
     if not isinstance(before, dict):
         return False
     present = {**config, "virtual": with_files(config.get("virtual"))}
-    chosen = [
+    unset = [
         f"{node}.{name}" for node, name in AUTOMATIC if not (present.get(node) or {}).get(name)
     ]
     changes = config_differences(before, present)
-    return all(is_below(change.key, chosen) for change in changes)
+    return all(is_below(change.key, ["search", "callbacks.trial", *unset]) for change in changes)
 
 
 def job_id() -> str | None:

@@ -200,6 +200,11 @@ def test_a_job_of_a_table_is_resumed_by_itself_and_beside_options(tmp_path, monk
     assert sys.argv[1:] == words
 
 
+def test_a_trial_of_a_search_is_resumed_by_itself(tmp_path):
+    stored = ["search=optuna", "++search.num_trials=3", "callbacks.trial.prune=false", "seed=1"]
+    assert trusted_overrides(stored, tmp_path) == ["seed=1"]
+
+
 OF_HYDRA = (
     "hydra.callbacks.x._target_=os.system", "+hydra.callbacks.x={_target_: sympy.sympify, a: x}",
     "++hydra.callbacks.x._target_=torch.load", "hydra/launcher=joblib", "+hydra/launcher=x",

@@ -168,7 +168,7 @@ def test_a_job_with_automatic_values_resumes(tmp_path):
     camera = tmp_path / "camera.json"
     lens = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0}
     camera.write_text(json.dumps(lens))
-    config = {"data": {"input_size": None}, "virtual": {"camera": str(camera)}}
+    config = {"data": {"input_size": None}, "virtual": {"camera": str(camera)}, "search": {"a": 1}}
     write_config(tmp_path, {"data": {"input_size": [96, 96]}, "virtual": {"camera": lens}})
     assert multirun.can_resume(config, tmp_path)
     assert not multirun.can_resume({**config, "data": {"input_size": [64, 64]}}, tmp_path)
