@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from hydra import compose, initialize_config_dir
 from hydra.experimental.callback import Callback
 from hydra.utils import get_class
 
@@ -170,6 +171,13 @@ def test_a_hostile_target_is_refused(place, target, tiny, tmp_path):
         build_all(config, tmp_path)
     assert repr(target) in error.value.got
     assert "\n" not in str(error.value)
+
+
+def test_every_folder_of_an_evaluation_is_below_output_dir():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        hydra = compose("evaluate", ["output_dir=x"], return_hydra_config=True).hydra
+    assert hydra.run.dir == hydra.sweep.dir
+    assert hydra.sweep.dir.startswith("x/evaluate/")
 
 
 def test_a_rejected_optimizer_value_is_reported_immediately():
