@@ -250,6 +250,8 @@ class _Model:
         try:
             if find(path).exists():  # a file, a released network or the folder of an export
                 self.estimator, self.reason = PoseEstimator.load(path), ""
+            elif self.run.config.get("ckpt_path", path) is None:
+                self.reason = entry.failure or "measured without a checkpoint"
             else:
                 self.reason = entry.failure or f"no file {path}"
         except UserError as error:

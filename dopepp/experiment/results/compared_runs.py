@@ -140,7 +140,7 @@ def read_run(folder: Path) -> Run:
     if run.report is not None and "checkpoint" in run.report.details:
         run.checkpoint = folder / str(run.report.details["checkpoint"])
     training, configs = config, [_without_automatic_values(folder, config)] if config else []
-    if "ckpt_path" in config:  # an evaluation: its checkpoint belongs to a training run
+    if config.get("ckpt_path") is not None:  # its checkpoint belongs to a training run
         run.checkpoint = Path(str(config["ckpt_path"]))
         trained = run.checkpoint.parent.parent
         training = _mapping(trained / CONFIG_FILE)

@@ -276,6 +276,14 @@ def test_an_evaluated_release_is_found_for_the_images(tmp_path):
     assert len(tiles) == 1
 
 
+def test_an_evaluation_without_a_checkpoint_has_no_images(tmp_path):
+    run = write_run(tmp_path, [], report_of("other", BAD))
+    write_config(run, {"ckpt_path": None, "results": "other_lmo-test.csv"})
+    tiles, reason = image_tiles([Entry("other", runs=[read_run(run)])], 1)
+    assert tiles == []
+    assert "other: measured without a checkpoint" in reason
+
+
 def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch):
     run = write_run(tmp_path / "run", [], report_of("dopepp", GOOD))
     monkeypatch.chdir(tmp_path)
