@@ -13,8 +13,7 @@ corners, no two of them opposite, predict the other five.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy  # SciPy loads its submodules on first use
@@ -56,8 +55,7 @@ ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])
 RIVALS: Final = -2  # marks a corner for which two instances prefer the same peak
 
 
-@dataclass(frozen=True)
-class ObjectPeaks:
+class ObjectPeaks(NamedTuple):
     """The peaks of one object's corners and centroids on one image.
 
     Attributes:
@@ -82,8 +80,7 @@ class ObjectPeaks:
     area_px: float
 
 
-@dataclass(frozen=True)
-class KeypointGroup:
+class KeypointGroup(NamedTuple):
     """An instance's corners and centroid, input pixels; NaN and a score of 0 without a peak."""
 
     position: Float[np.ndarray, "9 2"]
@@ -172,22 +169,6 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
     return solve_pnp(cuboid, group.position, K, covariance_px=covariance, widenings=WIDENINGS)
 
 
-def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
-    """Return log-likelihood ratios that each corner peak belongs to each instance.
-
-    A ratio is the product of both beliefs and the density of the angle between the field's vector
-    at the corner and the direction to the centroid, over a uniform density. A vector without
-    direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
-
-    Args:
-        peaks: Corner peaks and centroids.
-        max_angle: Largest allowed angle, radians; for larger angles, the result is −∞.
-        coincident_px: Distance from a centroid within which any angle is allowed.
-    """
-    arrays = (peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score)
-    return _direction_evidence(*arrays, max_angle, coincident_px)
-
-
 def associate(
     peaks: ObjectPeaks, evidence: Evidence, expected: Corners | None = None
 ) -> list[KeypointGroup]:
@@ -205,8 +186,8 @@ def associate(
     """
     deviation = np.full(len(evidence), PREDICTION_PX)
     if expected is None:
-        expected, deviation = _predict(peaks.position, evidence, peaks.centroid, peaks.area_px)
-    gain = _gain(evidence, peaks.position, peaks.covariance_px, expected, deviation, peaks.area_px)
+        expected, deviation = _predict(peaks, evidence)
+    gain = _gain(evidence, peaks, expected, deviation)
     count = len(evidence)
     position = np.full((count, NUM_KEYPOINTS, 2), np.nan)
     covariance = np.full((count, NUM_KEYPOINTS, 2, 2), np.nan)
@@ -246,18 +227,21 @@ def _averaged(covariance: Array) -> Array:
 
 
 @compiled()
-def _direction_evidence(
-    position: Array,
-    score: Array,
-    toward: Array,
-    centroid: Array,
-    centroid_score: Array,
-    max_angle: float,
-    coincident_px: float,
-) -> Array:
-    """Compute :func:`direction_evidence` from the fields of :class:`ObjectPeaks`."""
+def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
+    """Return log-likelihood ratios that each corner peak belongs to each instance.
+
+    A ratio is the product of both beliefs and the density of the angle between the field's vector
+    at the corner and the direction to the centroid, over a uniform density. A vector without
+    direction is neutral. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
+
+    Args:
+        peaks: Corner peaks and centroids.
+        max_angle: Largest allowed angle, radians; for larger angles, the result is −∞.
+        coincident_px: Distance from a centroid within which any angle is allowed.
+    """
+    position, score, toward, centroid = peaks.position, peaks.score, peaks.toward, peaks.centroid
     evidence = np.full((len(centroid), *score.shape), -math.inf)
-    beliefs = np.log(centroid_score)
+    beliefs = np.log(peaks.centroid_score)
     for k, m in np.ndindex(score.shape):
         if not score[k, m] > 0.0:
             continue
@@ -283,20 +267,14 @@ def _direction_evidence(
 
 
 @compiled()
-def _gain(
-    evidence: Array,
-    position: Array,
-    covariance_px: Array,
-    expected: Array,
-    deviation: Array,
-    area_px: float,
-) -> Array:
+def _gain(evidence: Array, peaks: ObjectPeaks, expected: Array, deviation: Array) -> Array:
     """Return ``evidence`` plus the evidence of the peaks' positions; negative sums become 0.
 
     The evidence of a position is the logarithm of a ratio: a Gaussian density around the expected
     position (``deviation``: its standard deviation for each instance, pixels) over the density of a
     peak anywhere on the maps. Without an expected position, this evidence is 0.
     """
+    position, covariance_px, area_px = peaks.position, peaks.covariance_px, peaks.area_px
     gain = np.zeros(evidence.shape)
     for i, k, m in np.ndindex(evidence.shape):
         if not evidence[i, k, m] > -math.inf:
@@ -331,15 +309,14 @@ def _unrivalled(gain: Array) -> Array:
 
 
 @compiled()
-def _predict(
-    position: Array, evidence: Array, centroid: Array, area_px: float
-) -> tuple[Array, Array]:
+def _predict(peaks: ObjectPeaks, evidence: Array) -> tuple[Array, Array]:
     """Predict the corners of each instance from three of its corner peaks by :func:`_best_triple`.
 
     Returns:
         (x, y) of the corners, NaN for an instance without three usable corners, and their standard
         deviation for each instance, pixels.
     """
+    position, centroid, area_px = peaks.position, peaks.centroid, peaks.area_px
     count = len(evidence)
     expected, deviation = np.full((count, NUM_CORNERS, 2), math.nan), np.empty(count)
     arms = np.empty((NUM_CORNERS, CANDIDATES, 2))

@@ -223,7 +223,7 @@ def test_matching_uses_the_first_points_of_a_template(detector):
     changed = templates.points.copy()
     changed[:, NUM_SUMMED:] = 0.0
     whole, part = (
-        match(responses, replace(templates, points=points), 41.0)
+        match(responses, templates._replace(points=points), 41.0)
         for points in (templates.points, changed)
     )
     assert templates.points.shape[1] > NUM_SUMMED

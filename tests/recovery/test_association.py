@@ -101,7 +101,7 @@ def test_the_triple_with_the_most_evidence_predicts_the_corners():
         toward = 0.05 * rng.normal(size=corners.shape)  # so short that all may belong together
         result = peaks(corners, toward, centroids)
         evidence = direction_evidence(result, math.pi, 8.0)
-        expected, deviation = _predict(result.position, evidence, centroids, result.area_px)
+        expected, deviation = _predict(result, evidence)
         for i, centroid in enumerate(centroids):
             best = -np.inf
             for triple in combinations(range(8), 3):

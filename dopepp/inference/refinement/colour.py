@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -154,19 +154,26 @@ def log_odds(
     columns = _tile_of(bins.shape[1], left * thinned, width * thinned, tiles)
     rows = _tile_of(bins.shape[0], top * thinned, height * thinned, tiles)
     counts = np.zeros((2, tiles, tiles, STEPS**3), np.float32)
-    sparse = (
+    sparse = _TiledBins(
         np.ascontiguousarray(bins[::thinned, ::thinned][counted]),
         np.ascontiguousarray(rows[::thinned][counted[0]]),
         np.ascontiguousarray(columns[::thinned][counted[1]]),
     )
-    limits = unsure_within, unsure, unsure + ring
-    if _count(*sparse, within, beyond, *limits, counts) < FEWEST:
+    if _count(sparse, within, beyond, (unsure_within, unsure, unsure + ring), counts) < FEWEST:
         return None
     tables = np.empty((tiles, tiles, STEPS**3), np.float32)
     _tables(counts, tables)
     odds = np.empty(bins.shape, np.float32)
-    _look_up(bins, rows, columns, tables, odds)
+    _look_up(_TiledBins(bins, rows, columns), tables, odds)
     return odds
+
+
+class _TiledBins(NamedTuple):
+    """Colour bins of an image that is divided into tiles."""
+
+    bins: Int[np.ndarray, "height width"]  # colour bin of each pixel
+    rows: Int[np.ndarray, "height"]  # tile of each row of pixels
+    columns: Int[np.ndarray, "width"]  # tile of each column of pixels
 
 
 def _tile_of(length: int, start: int, extent: int, tiles: int) -> Int[np.ndarray, "length"]:
@@ -185,32 +192,27 @@ def _bins(image: Array, bins: Array) -> None:
 
 @compiled()
 def _count(
-    bins: Array,
-    rows: Array,
-    columns: Array,
+    tiled: _TiledBins,
     within: Array,
     beyond: Array,
-    nearest_within: float,
-    nearest: float,
-    farthest: float,
+    limits: tuple[float, float, float],
     counts: Array,
 ) -> int:
     """Count the colours of part and surroundings in each tile.
 
     Args:
-        bins: Colour bin of each pixel.
-        rows: Tile of each row of pixels.
-        columns: Tile of each column of pixels.
+        tiled: Colour bins.
         within: Distance of each pixel inside the mask from the border, pixels.
         beyond: Distance of each pixel outside the mask from the border, pixels.
-        nearest_within: Pixels of the part this close to the border are not counted.
-        nearest: Surrounding pixels this close to the border are not counted.
-        farthest: Surrounding pixels beyond this distance are not counted.
+        limits: Pixels of the part up to the first distance from the border are not counted, nor
+            surrounding pixels up to the second and beyond the third.
         counts: Updated counts, (part or surroundings, tile rows, tile columns, bins).
 
     Returns:
         The smaller of the two numbers of counted pixels.
     """
+    bins, rows, columns = tiled
+    nearest_within, nearest, farthest = limits
     inside = outside = 0
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
@@ -269,16 +271,15 @@ def _tables(counts: Array, tables: Array) -> None:
 
 
 @compiled()
-def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Array) -> None:
+def _look_up(tiled: _TiledBins, tables: Array, odds: Array) -> None:
     """Write the log odds that each pixel shows the part, from the colour table of its tile.
 
     Args:
-        bins: Colour bins, shape (height, width).
-        rows: Tile of each row of pixels, shape (height,).
-        columns: Tile of each column of pixels, shape (width,).
+        tiled: Colour bins.
         tables: Log odds, shape (tiles, tiles, colours).
         odds: Filled with the log odds, shape (height, width).
     """
+    bins, rows, columns = tiled
     for v in range(bins.shape[0]):
         tables_of_row = tables[rows[v]]
         for u in range(bins.shape[1]):

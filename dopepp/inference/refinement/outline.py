@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -37,15 +37,15 @@ LONG_PX: Final = 4.0
 """Length from which an edge determines the normal; the directions of shorter edges vary."""
 
 
-@dataclass(frozen=True, eq=False)
-class OutlineMesh:
+class OutlineMesh(NamedTuple):
     """A mesh, prepared for silhouettes and outlines."""
 
     vertices: Vertices  # positions, metres
     faces: Faces  # corners of each triangle
     # Normal of each triangle (of any length) and its dot product with a corner
     planes: Float[np.ndarray, "faces 4"]
-    edges: Int[np.ndarray, "edges 2"]  # the two vertices of each edge
+    # The two vertices of each edge, in the direction of its first triangle
+    edges: Int[np.ndarray, "edges 2"]
     # Two triangles of each edge; the second is −1 if there is one only
     sides: Int[np.ndarray, "edges 2"]
     # 1 if both triangles run along the edge in the same direction, else 0
@@ -94,8 +94,7 @@ def make_outline_mesh(vertices: Vertices, faces: Faces) -> OutlineMesh:
     return OutlineMesh(vertices, faces, planes, edges, sides, *kinds, loose_edges, loose // 3)
 
 
-@dataclass(frozen=True, eq=False)
-class PosedMesh:
+class PosedMesh(NamedTuple):
     """Projection of a mesh at a pose."""
 
     T_cam_obj: Transform
@@ -108,9 +107,8 @@ def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> PosedMesh
     """Project a mesh at a pose; return None if a vertex is not in front of the camera."""
     arms, pixels = np.empty_like(mesh.vertices), np.empty((len(mesh.vertices), 2))
     front = np.empty(len(mesh.faces), np.bool_)
-    if not _pose(mesh.vertices, mesh.planes, T_cam_obj, K, arms, pixels, front):
-        return None
-    return PosedMesh(T_cam_obj, arms, pixels, front)
+    posed_mesh = PosedMesh(T_cam_obj, arms, pixels, front)
+    return posed_mesh if _pose(mesh, K, posed_mesh) else None
 
 
 def filled_mask(
@@ -120,9 +118,7 @@ def filled_mask(
     width, height = size
     mask = np.zeros((height, width), np.uint8)
     winding = np.empty((1 if mesh.is_closed else 2, height, width + 1), np.int32)
-    pixels, front = posed_mesh.pixels, posed_mesh.front
-    pairs = mesh.edges, mesh.sides, mesh.paired
-    _wind(pixels, front, *pairs, mesh.loose_edges, mesh.loose_sides, winding, mask)
+    _wind(mesh, posed_mesh, winding, mask)
     return mask
 
 
@@ -152,10 +148,7 @@ def find_contour(
         mask: Filled mask of the posed mesh.
         spacing: Approximate distance between points, pixels.
     """
-    edges, distance = (mesh.edges, mesh.sides, mesh.opposed), float(posed_mesh.T_cam_obj[2, 3])
-    rows = _walk(
-        *edges, posed_mesh.front, posed_mesh.arms, posed_mesh.pixels, distance, mask, spacing
-    )
+    rows = _walk(mesh, posed_mesh, mask, spacing)
     return Contour(rows[:, :3], rows[:, 3:5], rows[:, 5:])
 
 
@@ -169,23 +162,10 @@ def outline_rows(
 
 
 @compiled()
-def _pose(
-    vertices: Array, planes: Array, T: Array, K: Array, arms: Array, pixels: Array, front: Array
-) -> bool:
-    """Project a mesh, and find the triangles that face the camera.
-
-    Args:
-        vertices: Vertices in the object frame, metres.
-        planes: Normal and offset of each triangle's plane, object frame.
-        T: Pose of the object in the camera frame.
-        K: Camera matrix, pixels.
-        arms: Filled with the rotated vertices, relative to the object's origin, camera axes.
-        pixels: Filled with the projected vertices.
-        front: Filled with whether each triangle faces the camera.
-
-    Returns:
-        Whether all vertices are in front of the camera.
-    """
+def _pose(mesh: OutlineMesh, K: Array, posed_mesh: PosedMesh) -> bool:
+    """Fill a posed mesh with its projection; return whether all vertices are before the camera."""
+    vertices, planes = mesh.vertices, mesh.planes
+    T, arms, pixels, front = posed_mesh
     for i in range(len(vertices)):
         for r in range(3):
             arms[i, r] = (
@@ -206,32 +186,20 @@ def _pose(
 
 
 @compiled()
-def _wind(
-    pixels: Array,
-    front: Array,
-    edges: Array,
-    sides: Array,
-    paired: Array,
-    loose_edges: Array,
-    loose_sides: Array,
-    winding: Array,
-    mask: Array,
-) -> None:
+def _wind(mesh: OutlineMesh, posed_mesh: PosedMesh, winding: Array, mask: Array) -> None:
     """Set the pixels that the borders of front and back triangles wind around.
 
     Args:
-        pixels: Projected vertices.
-        front: Whether each triangle faces the camera.
-        edges: Vertices of each edge, in the direction of its first triangle.
-        sides: The two triangles of each edge.
-        paired: 1 for edges with exactly two triangles, which are oriented alike.
-        loose_edges: Vertices of each loose edge, in the direction of its triangle.
-        loose_sides: Triangle of each loose edge.
+        mesh: Mesh of the part.
+        posed_mesh: Mesh at its pose.
         winding: Filled, in the box of the vertices, with the winding number's changes along each
             row, for the triangles that face the camera and, in an open mesh, for those that face
             away.
         mask: Zeros; set to 1 inside the borders.
     """
+    pixels, front = posed_mesh.pixels, posed_mesh.front
+    edges, sides, paired = mesh.edges, mesh.sides, mesh.paired
+    loose_edges, loose_sides = mesh.loose_edges, mesh.loose_sides
     height, width = mask.shape
     low_x, low_y, high_x, high_y = width - 0.0, height - 0.0, 0.0, -1.0
     for i in range(len(pixels)):
@@ -285,33 +253,15 @@ def _cross_rows(pixels: Array, i: int, j: int, winding: Array) -> None:
 
 
 @compiled()
-def _walk(
-    edges: Array,
-    sides: Array,
-    opposed: Array,
-    front: Array,
-    arms: Array,
-    pixels: Array,
-    distance: float,
-    mask: Array,
-    spacing: float,
-) -> Array:
-    """Sample points of the silhouette's border along the edges of a mesh.
-
-    Args:
-        edges: Vertices of each edge.
-        sides: The two triangles of each edge; −1 for none.
-        opposed: 1 for edges whose triangles have opposite orientations.
-        front: Whether each triangle faces the camera.
-        arms: Rotated vertices, relative to the object's origin, camera axes.
-        pixels: Projected vertices.
-        distance: Depth of the object's origin, metres.
-        mask: Mask of the silhouette.
-        spacing: Distance between neighbouring points, pixels.
+def _walk(mesh: OutlineMesh, posed_mesh: PosedMesh, mask: Array, spacing: float) -> Array:
+    """Sample points of the silhouette's border along the edges of a mesh; see `find_contour`.
 
     Returns:
         Arm (3), pixel (2) and outward normal (2) of each point.
     """
+    edges, sides, opposed = mesh.edges, mesh.sides, mesh.opposed
+    T, arms, pixels, front = posed_mesh
+    distance = T[2, 3]
     rows, count, left = np.empty((256, 7)), 0, 0.5 * spacing
     normal = np.empty(2)
     for e in range(len(edges)):

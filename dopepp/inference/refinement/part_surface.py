@@ -8,9 +8,8 @@ other points lie in front of it on its viewing ray.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import combinations
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -50,13 +49,18 @@ STEP: Final = 2.0
 """Standard deviations of the depth by which a continued surface may differ from the part."""
 
 
-@dataclass(frozen=True, eq=False)
-class SurfacePoints:
-    """Points on a part's surface, object frame, metres."""
+class SurfacePoints(NamedTuple):
+    """Points on a part's surface in the frame of the object or of the camera, metres."""
 
     points: Points
     normals: Points  # unit normals of either sign
     spacing: float  # side of the square of surface that a point represents, metres
+
+    def posed(self, T_cam_obj: Transform, chosen: Visible | slice = slice(None)) -> SurfacePoints:
+        """Return the chosen points (default: all) in the camera frame."""
+        R = T_cam_obj[:3, :3].T
+        points = self.points[chosen] @ R + T_cam_obj[:3, 3]
+        return SurfacePoints(points, self.normals[chosen] @ R, self.spacing)
 
 
 def surface_points(points: Points) -> SurfacePoints:
@@ -91,8 +95,8 @@ def surface_points(points: Points) -> SurfacePoints:
 
 def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Visible:
     """Return which points are not hidden by the part itself; all must be in front of the camera."""
-    points = surface.points @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
-    normals = surface.normals @ T_cam_obj[:3, :3].T
+    posed = surface.posed(T_cam_obj)
+    points = posed.points
     rays = points / points[:, 2:]
     # All cells have the size of a disc at the nearest point.
     cell = DISC * surface.spacing / points[:, 2].min()
@@ -102,13 +106,21 @@ def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Visible:
     order = np.argsort(flat, kind="stable")
     starts = np.searchsorted(flat[order], np.arange(columns * rows + 1))
     is_visible = np.empty(len(points), np.bool_)
-    grid = keys, order, starts, columns, rows
-    _hide(points, normals, rays, *grid, surface.spacing, is_visible)
+    _hide(posed, rays, _Grid(keys, order, starts, columns, rows), is_visible)
     return is_visible
 
 
-@dataclass(frozen=True, eq=False)
-class DepthView:
+class _Grid(NamedTuple):
+    """Points sorted by cells of a grid over the image."""
+
+    keys: Int[np.ndarray, "points 2"]  # column and row of each point's cell
+    order: Int[np.ndarray, "points"]  # indices of the points, sorted by cell
+    starts: Int[np.ndarray, "cells"]  # position in `order` of each cell's first point
+    columns: int
+    rows: int
+
+
+class DepthView(NamedTuple):
     """A subsampled crop of a depth image."""
 
     depth: Depth  # metres along z, float32, 0 where unknown
@@ -137,12 +149,10 @@ def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView 
     return DepthView(crop, K, np.stack([x, y, np.ones(crop.shape)], -1), noise)
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceOverlay:
+class SurfaceOverlay(NamedTuple):
     """Comparison of a posed part's visible points with a depth view."""
 
-    points: Points  # points within the view, camera frame, metres
-    normals: Points  # unit normals of either sign
+    surface: SurfacePoints  # points within the view, camera frame
     pixels: Int[np.ndarray, "points 2"]  # column and row of each point
     distance: Depth  # distance of every pixel to the nearest point, spacings
     nearest: Int[np.ndarray, "height width"]  # index of that point
@@ -191,14 +201,13 @@ def overlay_surface(
     Returns:
         The comparison, or None if no visible point lies in the view.
     """
-    points = surface.points[is_visible] @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
-    normals = surface.normals[is_visible] @ T_cam_obj[:3, :3].T
+    points, normals, spacing = surface.posed(T_cam_obj, is_visible)
     exact = points[:, :2] / points[:, 2:] * view.K.diagonal()[:2] + view.K[:2, 2]
     pixels = np.rint(exact).astype(np.int64)
     inside = ((pixels >= 0) & (pixels < view.depth.shape[::-1])).all(axis=1)
     if not inside.any():
         return None
-    points, normals, pixels = points[inside], normals[inside], pixels[inside]
+    points, pixels = points[inside], pixels[inside]
     order = np.argsort(-points[:, 2])  # the nearer of two points overwrites the farther
     free = np.ones(view.depth.shape, np.uint8)
     free[pixels[:, 1], pixels[:, 0]] = 0
@@ -207,11 +216,11 @@ def overlay_surface(
     owner[labels[pixels[order, 1], pixels[order, 0]]] = order
     nearest = owner[labels]
     # If the spacing is below a pixel, the nearest pixel counts as covered.
-    distance /= max(surface.spacing * view.K[0, 0] / points[:, 2].mean(), 1.0)
-    offset = np.empty(view.depth.shape)
-    limit = EXTENDED * surface.spacing
-    _offsets(view.depth, view.rays, distance, nearest, points, normals, BESIDE, limit, offset)
-    return SurfaceOverlay(points, normals, pixels, distance, nearest, offset)
+    distance /= max(spacing * view.K[0, 0] / points[:, 2].mean(), 1.0)
+    shown = SurfacePoints(points, normals[inside], spacing)
+    overlay = SurfaceOverlay(shown, pixels, distance, nearest, np.empty(view.depth.shape))
+    _offsets(view, overlay)
+    return overlay
 
 
 def nearest_zero(mask: Array) -> tuple[Array, Array]:
@@ -223,32 +232,17 @@ def nearest_zero(mask: Array) -> tuple[Array, Array]:
 
 
 @compiled()
-def _hide(
-    points: Array,
-    normals: Array,
-    rays: Array,
-    keys: Array,
-    order: Array,
-    starts: Array,
-    columns: int,
-    rows: int,
-    spacing: float,
-    is_visible: Array,
-) -> None:
+def _hide(posed: SurfacePoints, rays: Array, grid: _Grid, is_visible: Array) -> None:
     """Write which points are visible: those that fewer than two discs of other points hide.
 
     Args:
-        points: Points of the posed part, camera frame, metres.
-        normals: Normals of the points, camera frame.
+        posed: Points of the posed part, camera frame.
         rays: Ray (x/z, y/z) of each point.
-        keys: Column and row of each point's cell in a grid over the image.
-        order: Indices of the points, sorted by cell.
-        starts: Position in ``order`` of each cell's first point.
-        columns: Number of columns of the grid.
-        rows: Number of rows of the grid.
-        spacing: Distance between neighbouring points, metres.
+        grid: Points by cells, which have the size of a disc at the nearest point.
         is_visible: Filled with whether each point is visible.
     """
+    points, normals, spacing = posed
+    keys, order, starts, columns, rows = grid
     clearance, reach = CLEARANCE * spacing, DISC * spacing
     for i in range(points.shape[0]):
         z, votes = points[i, 2], 0
@@ -274,34 +268,15 @@ def _hide(
 
 
 @compiled()
-def _offsets(
-    depth: Array,
-    rays: Array,
-    distance: Array,
-    nearest: Array,
-    points: Array,
-    normals: Array,
-    farthest: float,
-    limit: float,
-    offset: Array,
-) -> None:
-    """Write each pixel's measured depth minus the depth of the part's nearest plane, metres.
-
-    Args:
-        depth: Measured depth, metres; 0 where unknown.
-        rays: Ray (x/z, y/z, 1) of each pixel.
-        distance: Distance of each pixel from the part's nearest visible point, spacings.
-        nearest: Index of this point.
-        points: Points of the posed part, camera frame, metres.
-        normals: Normals of the points, camera frame.
-        farthest: Distance from the nearest point beyond which a pixel gets NaN, spacings.
-        limit: Largest difference between the depths of plane and point, metres.
-        offset: Filled with the differences; NaN where unknown.
-    """
+def _offsets(view: DepthView, overlay: SurfaceOverlay) -> None:
+    """Write the offsets of an overlay; NaN beyond the surroundings and where depth is unknown."""
+    depth, rays = view.depth, view.rays
+    (points, normals, spacing), _, distance, nearest, offset = overlay
+    limit = EXTENDED * spacing
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             offset[v, u] = np.nan
-            if depth[v, u] > 0.0 and distance[v, u] <= farthest:
+            if depth[v, u] > 0.0 and distance[v, u] <= BESIDE:
                 j = nearest[v, u]
                 z = points[j, 2]
                 plane = plane_depth(points[j], normals[j], rays[v, u])

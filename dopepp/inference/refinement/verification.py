@@ -133,10 +133,7 @@ class SharpEdges:
         """Return the triangle at each pixel, −1 for none."""
         width, height = size
         ids = np.full((height, width), -1, np.int32)
-        inverse_depth = 1.0 / (posed_mesh.arms[:, 2] + posed_mesh.T_cam_obj[2, 3])
-        nearest = np.zeros((height, width), np.float32)
-        shown = posed_mesh.front if self.mesh.is_closed else np.ones_like(posed_mesh.front)
-        _draw(posed_mesh.pixels, inverse_depth, self.mesh.faces, shown, ids, nearest)
+        _draw(self.mesh, posed_mesh, ids, np.zeros((height, width), np.float32))
         return ids
 
     def visible(
@@ -407,22 +404,20 @@ def _contrast(colours: RGBImage, outline: Float[np.ndarray, "points 4"]) -> floa
 
 
 @compiled()
-def _draw(
-    pixels: Array, inverse_depth: Array, faces: Array, shown: Array, ids: Array, nearest: Array
-) -> None:
+def _draw(mesh: OutlineMesh, posed_mesh: PosedMesh, ids: Array, nearest: Array) -> None:
     """Write the nearest visible triangle at each pixel's centre.
 
     Args:
-        pixels: Projected vertices.
-        inverse_depth: Inverse depth of each vertex, 1/m.
-        faces: Vertices of each triangle.
-        shown: Whether each triangle is drawn.
+        mesh: Mesh of the part.
+        posed_mesh: Mesh at its pose.
         ids: Filled with the triangle at each pixel; unchanged where there is none.
         nearest: Filled with the inverse depth at each pixel; zeros before.
     """
+    faces, is_closed = mesh.faces, len(mesh.loose_sides) == 0
+    T, arms, pixels, front = posed_mesh
     height, width = ids.shape
     for f in range(len(faces)):
-        if not shown[f]:
+        if is_closed and not front[f]:
             continue
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, bx, by = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1]
@@ -439,7 +434,8 @@ def _draw(
         per_area = 1.0 / area
         a_u, a_v = (by - cy) * per_area, (cx - bx) * per_area
         b_u, b_v = (cy - ay) * per_area, (ax - cx) * per_area
-        za, zb, zc = inverse_depth[a], inverse_depth[b], inverse_depth[c]
+        za, zb = 1.0 / (arms[a, 2] + T[2, 3]), 1.0 / (arms[b, 2] + T[2, 3])
+        zc = 1.0 / (arms[c, 2] + T[2, 3])
         for v in range(first, last + 1):
             for u in range(left, right + 1):
                 wa = a_u * (u - cx) + a_v * (v - cy)

@@ -1,8 +1,8 @@
 """Local search of poses and views for matches with a larger edge response.
 
 The functions share the names of their arrays: ``maps`` are edge responses by orientation, row and
-column; ``points`` (diameters) and ``normals`` (radians) are the edge points of a view or of all
-views; ``poses`` has column, row, in-plane rotation and projected diameter of each match.
+column; ``points`` (diameters) and ``normals`` (radians) are the edge points of a view; ``poses``
+has column, row, in-plane rotation and projected diameter of each match.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.inference.templates.responses import orientation_bin
+from dopepp.inference.templates.views import Templates
 
 ROLL_STEP: Final = math.radians(5.0)  # step of the in-plane rotation on the grid
 GROWTH: Final = 0.03  # first relative step of the size
@@ -115,13 +116,7 @@ def _climb(
 
 @compiled(fastmath=True)
 def search_nearby(
-    maps: Array,
-    points: Array,
-    normals: Array,
-    views: Array,
-    poses: Array,
-    reach: float,
-    best: Array,
+    maps: Array, templates: Templates, views: Array, poses: Array, reach: float, best: Array
 ) -> None:
     """Move each match to the highest response nearby: first on a grid, then by :func:`_climb`.
 
@@ -129,6 +124,7 @@ def search_nearby(
     filled with the response of each match.
     """
     height, width = maps.shape[1], maps.shape[2]
+    points, normals = templates.points, templates.normals
     workspace = _workspace(points.shape[1])
     offsets, bins = workspace[0][0], workspace[1][0]
     columns, rows, sums = np.empty(5, np.int64), np.empty(5, np.int64), np.empty((5, 5), np.int64)
@@ -159,20 +155,15 @@ def search_nearby(
 
 @compiled(fastmath=True)
 def replace_views(
-    maps: Array,
-    points: Array,
-    normals: Array,
-    neighbours: Array,
-    twists: Array,
-    views: Array,
-    poses: Array,
-    responses: Array,
+    maps: Array, templates: Templates, views: Array, poses: Array, responses: Array
 ) -> None:
     """Replace the view of each match by the neighbour with the largest response, repeatedly.
 
     ``views`` and ``poses`` are updated in place, and ``responses`` is filled with the response of
     each match.
     """
+    points, normals = templates.points, templates.normals
+    neighbours, twists = templates.neighbours, templates.twists
     pose, best = np.empty(4), np.empty(4)
     workspace = _workspace(points.shape[1])
     for i in range(len(views)):

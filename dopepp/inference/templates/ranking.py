@@ -89,7 +89,7 @@ def move_nearby(
         Moved matches, and their features.
     """
     poses, best = matches.poses.copy(), np.empty(len(matches.poses))
-    search_nearby(responses, templates.points, templates.normals, matches.views, poses, reach, best)
+    search_nearby(responses, templates, matches.views, poses, reach, best)
     matches = matches._replace(poses=poses)
     return matches, _features(matches, best, templates, responses, image)
 
@@ -102,8 +102,7 @@ def improve_views(
     Arguments and results are as in :func:`move_nearby`.
     """
     views, poses, best = matches.views.copy(), matches.poses.copy(), np.empty(len(matches.poses))
-    lines = templates.points, templates.normals
-    replace_views(responses, *lines, templates.neighbours, templates.twists, views, poses, best)
+    replace_views(responses, templates, views, poses, best)
     matches = matches._replace(views=views, poses=poses)
     return matches, _features(matches, best, templates, responses, image)
 
@@ -117,8 +116,7 @@ def _features(
 ) -> Features:
     """Return the features of matches; ``best`` are the mean responses of their points."""
     features = np.zeros((len(best), len(FEATURES)))
-    lines = templates.points, templates.normals, templates.is_outline, templates.inner
-    _describe(responses, image, *lines, matches.views, matches.poses, features)
+    _describe(responses, image, templates, matches, features)
     features[:, 0] = matches.scores
     features[:, 1] = (best - matches.means) / matches.deviations
     features[:, 2], features[:, 9] = best, templates.extents[matches.views]
@@ -127,20 +125,12 @@ def _features(
 
 @compiled(fastmath=True)
 def _describe(
-    maps: Array,
-    image: Array,
-    points: Array,
-    normals: Array,
-    is_outline: Array,
-    inner: Array,
-    views: Array,
-    poses: Array,
-    features: Array,
+    maps: Array, image: Array, templates: Templates, matches: Matches, features: Array
 ) -> None:
-    """Write to ``features`` each match's image features, except the mean response.
-
-    The arrays are those of :mod:`~.local_search`.
-    """
+    """Write to ``features`` each match's image features, except the mean response."""
+    points, normals = templates.points, templates.normals
+    is_outline, inner = templates.is_outline, templates.inner
+    views, poses = matches.views, matches.poses
     height, width = maps.shape[1], maps.shape[2]
     mean, colours = np.zeros(3), np.zeros((inner.shape[1], 3))
     for i in range(len(views)):

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -37,8 +36,7 @@ NEAREST: Final = 1.1  # smallest distance from which a part is drawn, diameters
 Rotations = Float[np.ndarray, "views 3 3"]
 
 
-@dataclass(frozen=True, eq=False)
-class Templates:
+class Templates(NamedTuple):
     """Points of all views, relative to the projection of the part's centre.
 
     The unit of length is the diameter, projected at the depth of the centre.
@@ -104,7 +102,7 @@ def make_templates(
     K, size = camera_matrix(focal, focal, half, half), (2 * half, 2 * half)
     lines, inner = [], []
     for R in rotations:
-        line, inside = _drawn(mesh, edges, centre, distance, R, K, size)
+        line, inside = _drawn(edges, centre, distance, R, K, size)
         lines.append(_spread(line, NUM_POINTS))
         inner.append(_spread(inside, NUM_INNER))
     rows = np.stack(lines)
@@ -122,14 +120,9 @@ def make_templates(
 
 def concatenate_templates(groups: Sequence[Templates]) -> Templates:
     """Concatenate groups of templates with equal numbers of views."""
-    templates = Templates(
-        *(
-            np.concatenate([getattr(group, field.name) for group in groups])
-            for field in fields(Templates)
-        )
-    )
+    templates = Templates(*map(np.concatenate, zip(*groups, strict=True)))
     first = np.repeat(np.arange(len(groups)) * len(groups[0].points), len(groups[0].points))
-    return replace(templates, neighbours=templates.neighbours + first[:, None])
+    return templates._replace(neighbours=templates.neighbours + first[:, None])
 
 
 def _neighbours(
@@ -145,7 +138,6 @@ def _neighbours(
 
 
 def _drawn(
-    mesh: OutlineMesh,
     edges: SharpEdges,
     centre: Float[np.ndarray, "3"],
     distance: float,
@@ -159,11 +151,12 @@ def _drawn(
         Pixel, normal and kind (1: outline, 0: crease) of edge points; and pixels inside the
         outline, far from edges.
     """
-    posed_mesh = posed(mesh, make_transform(R, np.array([0.0, 0.0, distance]) - R @ centre), K)
+    T_cam_obj = make_transform(R, np.array([0.0, 0.0, distance]) - R @ centre)
+    posed_mesh = posed(edges.mesh, T_cam_obj, K)
     assert posed_mesh is not None  # the whole part is in front of the camera
     ids = edges.drawn(posed_mesh, size)
     mask = (ids >= 0).astype(np.uint8)
-    contour = find_contour(mesh, posed_mesh, mask, SPACING_PX)
+    contour = find_contour(edges.mesh, posed_mesh, mask, SPACING_PX)
     creases = edges.visible(posed_mesh, ids, SPACING_PX)
     outline = np.column_stack([contour.pixels, contour.normals, np.ones(len(contour))])
     lines = np.concatenate([outline, np.column_stack([creases, np.zeros(len(creases))])])

@@ -170,7 +170,7 @@ def test_planes_pull_by_what_is_measured_on_the_part(box):
     for measured in (depth, hidden, holes):
         view = view_around(measured, K, transform(off, surface.points))
         overlay = overlay_surface(view, surface, visible(surface, off), off)
-        H, g = plane_terms(view, overlay, off[:3, 3], surface.spacing, 0.02)
+        H, g = plane_terms(view, overlay, off[:3, 3], 0.02)
         assert_allclose(H, H.T)
         step = np.linalg.solve(H + np.diag([1e-6] * 3 + [1e2] * 3), g)
         assert_allclose(step[5], -0.004, atol=3e-4)
@@ -231,7 +231,7 @@ def test_outline_pulls_a_shifted_part_back(box):
         off = moved(FACING, x=shift)
         view = view_around(depth, K, transform(off, surface.points))
         overlay = overlay_surface(view, surface, visible(surface, off), off)
-        H, g = outline_terms(view, overlay, off[:3, 3], surface.spacing, 0.02)
+        H, g = outline_terms(view, overlay, off[:3, 3], 0.02)
         step = np.linalg.solve(H[3:5, 3:5], g[3:5])
         assert -2 * shift - 0.002 <= step[0] <= 0.002 - shift / 2
         assert abs(step[1]) < 0.002

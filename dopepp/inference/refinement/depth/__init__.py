@@ -25,6 +25,7 @@ from dopepp.inference.network_input import Depth
 from dopepp.inference.refinement.depth.terms import DepthTerm
 from dopepp.inference.refinement.part_surface import (
     GATE,
+    DepthView,
     SurfacePoints,
     Visible,
     overlay_surface,
@@ -202,9 +203,7 @@ class DepthEvidence:
         moved = pose[:3, 3] - self.prior.T_cam_obj[:3, 3]
         step, tolerance = stage.search * self._diameter, stage.tolerance * view.noise
         shift = np.zeros(3)
-        num_votes = _search(
-            view.depth, view.K, points, information, moved, step, view.noise, half, tolerance, shift
-        )
+        num_votes = _search(view, points, information, moved, step, half, tolerance, shift)
         if num_votes < MIN_FOUND:
             return None
         return make_transform(pose[:3, :3], pose[:3, 3] + shift)
@@ -237,13 +236,11 @@ class Fit:
 
 @compiled()
 def _search(
-    depth: Array,
-    K: Array,
+    view: DepthView,
     points: Array,
     information: Array,
     moved: Array,
     step: float,
-    bin_size: float,
     half: int,
     tolerance: float,
     shift: Array,
@@ -255,13 +252,11 @@ def _search(
     for occluded points, for points without depth, and for the distance from the prior.
 
     Args:
-        depth: Depth image, shape (height, width), metres.
-        K: Camera matrix, shape (3, 3), pixels.
+        view: Crop of the depth image; the size of a bin along z is the noise.
         points: Visible points in the camera frame, shape (n, 3), metres.
         information: Information matrix of the prior about a translation, shape (3, 3), 1/m².
         moved: Translation from the prior's pose to the present pose, shape (3,), metres.
         step: Distance between neighbouring shifts along x and y, metres.
-        bin_size: Size of a bin along z, metres.
         half: Number of bins on each side of the present depth.
         tolerance: Depth difference at which the weight of a vote falls to 0, metres.
         shift: Output: the best shift in the camera frame, shape (3,), metres.
@@ -269,6 +264,7 @@ def _search(
     Returns:
         Number of points that agree with the best shift.
     """
+    depth, K, _, bin_size = view
     rows, columns = depth.shape
     count = points.shape[0]
     width = max(1, int(tolerance / bin_size))

@@ -53,19 +53,19 @@ class DepthTerm:
 
     def __call__(self, pose: Transform, prior: NormalEquations, /) -> NormalEquations | None:
         """Linearise the term at a pose; None if no point is within the view."""
-        view, origin, spacing = self.view, pose[:3, 3], self.surface.spacing
+        view, origin = self.view, pose[:3, 3]
         overlay = overlay_surface(view, self.surface, self.is_visible, pose)
         if overlay is None:
             return None
-        H, g = plane_terms(view, overlay, origin, spacing, self.reach)
+        H, g = plane_terms(view, overlay, origin, self.reach)
         if not self.outline:
             return H, g
-        H_outline, g_outline = outline_terms(view, overlay, origin, spacing, self.outline)
+        H_outline, g_outline = outline_terms(view, overlay, origin, self.outline)
         return H + H_outline, g + g_outline
 
 
 def plane_terms(
-    view: DepthView, overlay: SurfaceOverlay, origin: Vector, spacing: float, reach: float
+    view: DepthView, overlay: SurfaceOverlay, origin: Vector, reach: float
 ) -> NormalEquations:
     """Return normal equations of a posed part's point-to-plane terms; all lengths are metres.
 
@@ -73,31 +73,28 @@ def plane_terms(
         view: Crop of the depth image.
         overlay: Comparison of the posed part with the depth.
         origin: Object's origin, camera frame.
-        spacing: Spacing of the part's points.
         reach: Distance from a point's plane above which a pixel has no weight.
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
-    planes = overlay.distance, overlay.nearest, overlay.points, overlay.normals
-    limits = np.ascontiguousarray(origin), reach, view.noise, PLANE_DEVIATION * spacing
-    count = _add_planes(view.depth, view.rays, *planes, *limits, H, g)
+    count = _add_planes(view, overlay, np.ascontiguousarray(origin), reach, H, g)
     share = min(1.0, INDEPENDENT / max(1.0, count))
     return share * H, share * g
 
 
 def outline_terms(
-    view: DepthView, overlay: SurfaceOverlay, origin: Vector, spacing: float, reach: float
+    view: DepthView, overlay: SurfaceOverlay, origin: Vector, reach: float
 ) -> NormalEquations:
     """Return normal equations of the outline terms; see :func:`plane_terms` for the arguments.
 
-    ``spacing`` is also the standard deviation of an outline point's position. A point has no weight
-    if the measured outline is farther away than ``reach``.
+    The standard deviation of an outline point's position is the spacing of the points. A point has
+    no weight if the measured outline is farther away than ``reach``.
     """
-    gate = GATE * view.noise
+    gate, spacing = GATE * view.noise, overlay.surface.spacing
     offset = overlay.at_points
     in_front = np.flatnonzero((offset > gate) | np.isnan(offset))
     supported = overlay.covered & (np.abs(overlay.offset) <= gate)
     continues = overlay.continues(view.noise, reach / spacing)
-    scale = float(overlay.points[:, 2].mean()) / view.K[0, 0]
+    scale = float(overlay.surface.points[:, 2].mean()) / view.K[0, 0]
     # A point represents spacing² of surface, a pixel scale².
     pixel_weight = min(1.0, (scale / spacing) ** 2)
     H, g = np.zeros((6, 6)), np.zeros(6)
@@ -135,7 +132,7 @@ def _to_surface(
     target = np.zeros((int(labels.max()) + 1, 2))
     target[labels[rows, columns]] = np.stack([columns, rows], axis=1)
     pixels = overlay.pixels[in_front]
-    return overlay.points[in_front], target[labels[pixels[:, 1], pixels[:, 0]]] - pixels
+    return overlay.surface.points[in_front], target[labels[pixels[:, 1], pixels[:, 0]]] - pixels
 
 
 def _to_pixels(overlay: SurfaceOverlay, continues: Mask) -> Pulls:
@@ -149,45 +146,24 @@ def _to_pixels(overlay: SurfaceOverlay, continues: Mask) -> Pulls:
     nearest = overlay.nearest[rows, columns]
     pulls = np.stack([columns, rows], axis=1) - overlay.pixels[nearest]
     short = 1.0 - COVERED / overlay.distance[rows, columns]
-    return overlay.points[nearest], pulls * short[:, None]
+    return overlay.surface.points[nearest], pulls * short[:, None]
 
 
 @compiled()
 def _add_planes(
-    depth: Array,
-    rays: Array,
-    distance: Array,
-    nearest: Array,
-    points: Array,
-    normals: Array,
-    origin: Array,
-    reach: float,
-    noise: float,
-    rough: float,
-    H: Array,
-    g: Array,
+    view: DepthView, overlay: SurfaceOverlay, origin: Array, reach: float, H: Array, g: Array
 ) -> float:
     """Add the point-to-plane terms of all pixels that the part covers to the normal equations.
 
     A rotation ω and a shift τ of the part move a point at ``arm`` from its origin by ω × arm + τ.
-
-    Args:
-        depth: Measured depth, metres; 0 where unknown.
-        rays: Ray (x/z, y/z, 1) of each pixel.
-        distance: Distance of each pixel from the part's nearest visible point, spacings.
-        nearest: Index of this point.
-        points: Points of the posed part, camera frame, metres.
-        normals: Normals of the points, camera frame.
-        origin: Origin of the part, camera frame, metres.
-        reach: Residual from which the robust weight is 0, metres.
-        noise: Standard deviation of the depth, metres.
-        rough: Standard deviation of the part's surface, metres.
-        H: Updated 6×6 matrix of the normal equations.
-        g: Updated right-hand side of the normal equations.
+    See :func:`plane_terms` for the arguments; ``H`` and ``g`` are updated.
 
     Returns:
         The sum of the weights.
     """
+    depth, _, rays, noise = view
+    (points, normals, spacing), _, distance, nearest, _ = overlay
+    rough = PLANE_DEVIATION * spacing
     row = np.empty(6)
     total = 0.0
     for v in range(depth.shape[0]):

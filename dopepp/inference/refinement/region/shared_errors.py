@@ -71,19 +71,18 @@ def region_terms(
     """
     H, g = np.zeros((7, 7)), np.zeros(7)
     independent, alike = min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing
-    prior_H, prior_g = map(np.ascontiguousarray, prior)
-    mean, information = map(np.ascontiguousarray, (shifts.mean, shifts.information))
-    _terms(rows, mean, information, prior_H, prior_g, independent, alike, H, g)
+    prior = np.ascontiguousarray(prior[0]), np.ascontiguousarray(prior[1])
+    _terms(rows, shifts, prior, independent, alike, H, g)
     # The Schur complement eliminates the offset.
     last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
     H, g = H[:6, :6] - last[:, None] * H[:6, 6], g[:6] - last * g[6]
-    _eliminate_scale(H, g, prior_H, prior_g, position, max(scale_error, 1e-9))
+    _eliminate_scale(H, g, prior, position, max(scale_error, 1e-9))
     return H, g
 
 
 @compiled()
 def _eliminate_scale(
-    H: Array, g: Array, prior_H: Array, prior_g: Array, position: Array, limit: float
+    H: Array, g: Array, prior: NormalEquations, position: Array, limit: float
 ) -> None:
     """Eliminate a bounded error of the scale from the normal equations, in place.
 
@@ -93,11 +92,11 @@ def _eliminate_scale(
     Args:
         H: Matrix of the outline's normal equations.
         g: Right side of the outline's normal equations.
-        prior_H: Information of the prior.
-        prior_g: Right side of the prior's normal equations.
+        prior: Normal equations of the prior.
         position: Position of the part in the camera frame, metres.
         limit: Largest relative error of the scale.
     """
+    prior_H, prior_g = prior
     both, target, column = np.empty((6, 6)), np.empty(6), np.zeros(6)
     step, pull = np.empty(6), np.empty(6)  # steps for a scale error of 0 and of 1
     for c in range(6):
@@ -145,10 +144,8 @@ def _truncated_mean(mean: float, deviation: float, limit: float) -> float:
 @compiled()
 def _terms(
     rows: Array,
-    means: Array,
-    information: Array,
-    prior_H: Array,
-    prior_g: Array,
+    shifts: Shifts,
+    prior: NormalEquations,
     independent: float,
     alike: float,
     H: Array,
@@ -158,15 +155,14 @@ def _terms(
 
     Args:
         rows: Derivatives of each point's motion by the pose, (n, 6).
-        means: Measured shift of the outline at each point, pixels.
-        information: Inverse variance of each shift.
-        prior_H: Information of the prior.
-        prior_g: Right side of the prior's normal equations.
+        shifts: Measured shift of the outline at each point.
+        prior: Normal equations of the prior.
         independent: Number of measurements that a point represents if errors are small.
         alike: Number of neighbouring points that share an error otherwise.
         H: Filled with the 7×7 matrix of the normal equations.
         g: Filled with their right-hand side.
     """
+    (means, information), (prior_H, prior_g) = shifts, prior
     squares, valid, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
     num_valid = 0
     for i in range(len(rows)):

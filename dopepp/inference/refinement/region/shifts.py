@@ -15,7 +15,6 @@ zero.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -50,8 +49,7 @@ FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
 edge's centre. For inaccurate start poses, these weights are worse than :data:`FOUND`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shifts:
+class Shifts(NamedTuple):
     """Shift of the part's border on the image from a projected outline, along each normal."""
 
     mean: Float[np.ndarray, "points"]  # pixels, outward
@@ -76,34 +74,33 @@ def find_shifts(
         step: Distance between samples, pixels.
         weights: Exponents of the likelihoods of colours and edges.
     """
-    count = max(2, round(reach / step))
-    changes = np.empty((len(contour), 2 * count + 2))
-    strength = _changes(colours, contour.pixels, contour.normals, step, count, changes)
-    shifts = np.empty((len(contour), 2))
-    _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, *weights, shifts)
-    return Shifts(shifts[:, 0], shifts[:, 1])
+    samples = _Samples(contour.pixels, contour.normals, step, max(2, round(reach / step)))
+    shifts = Shifts(np.empty(len(contour)), np.empty(len(contour)))
+    _shifts(odds, samples, _changes(colours, samples), weights, shifts)
+    return shifts
+
+
+class _Samples(NamedTuple):
+    """Positions along the normals of an outline at which the image is sampled."""
+
+    pixels: Float[np.ndarray, "points 2"]  # points of the outline
+    normals: Float[np.ndarray, "points 2"]  # outward unit normals
+    step: float  # distance between samples, pixels
+    count: int  # number of samples to either side of a point
 
 
 @compiled()
-def _changes(
-    colours: Array, pixels: Array, normals: Array, step: float, count: int, changes: Array
-) -> float:
+def _changes(colours: Array, positions: _Samples) -> Array:
     """Measure how much the image changes between neighbouring samples along each normal.
 
     A change is the difference between the mean of the next two samples and the mean of the previous
     two, in the channel in which this difference is largest.
 
-    Args:
-        colours: RGB crop of the image.
-        pixels: Points of the projected outline.
-        normals: Outward unit normal of each point.
-        step: Distance between samples, pixels.
-        count: Number of samples to either side of a point.
-        changes: Filled with the 2·count + 2 changes of each point, grey levels.
-
     Returns:
-        The mean change plus ``MIN_CHANGE``, grey levels.
+        The 2·count + 2 changes of each point, divided by the mean change plus ``MIN_CHANGE``.
     """
+    pixels, normals, step, count = positions
+    changes = np.empty((len(pixels), 2 * count + 2))
     height, width = colours.shape[:2]
     samples = np.empty((2 * count + 5, 3))
     total = 0.0
@@ -127,36 +124,19 @@ def _changes(
                 most = max(most, abs(samples[k + 2, c] + samples[k + 3, c] - before))
             changes[i, k] = 0.25 * most
             total += changes[i, k]
-    return total / changes.size + MIN_CHANGE
+    strength = total / changes.size + MIN_CHANGE
+    for i in range(len(pixels)):
+        for k in range(2 * count + 2):
+            changes[i, k] /= strength
+    return changes
 
 
 @compiled()
 def _shifts(
-    odds: Array,
-    pixels: Array,
-    normals: Array,
-    changes: Array,
-    strength: float,
-    step: float,
-    count: int,
-    colour: float,
-    edge: float,
-    shifts: Array,
+    odds: Array, positions: _Samples, changes: Array, weights: Weights, shifts: Shifts
 ) -> None:
-    """Estimate the shift of the part's border along each normal, and its information.
-
-    Args:
-        odds: Log odds of part against surroundings for every pixel.
-        pixels: Points of the projected outline.
-        normals: Outward unit normal of each point.
-        changes: Change of the image between neighbouring samples of each normal.
-        strength: Change that counts as an edge.
-        step: Distance between samples, pixels.
-        count: Number of samples to either side of a point.
-        colour: Weight of the colours.
-        edge: Weight of the edges.
-        shifts: Filled with mean (pixels) and information (pixels⁻²) of each point.
-    """
+    """Fill ``shifts``, for the log odds of each pixel and the result of :func:`_changes`."""
+    pixels, normals, step, count = positions
     sums = np.empty(2 * count + 2)
     # The part may end between any two samples, before the first or after the last.
     unknown = step * step * (len(sums) ** 2 - 1) / 12.0
@@ -164,10 +144,10 @@ def _shifts(
     for i in range(len(pixels)):
         before, most = 0.0, -math.inf
         for k in range(len(sums)):
-            sums[k] = before + edge * math.log(1.0 + (changes[i, k] / strength) ** 2)
+            sums[k] = before + weights.edge * math.log(1.0 + changes[i, k] ** 2)
             most = max(most, sums[k])
             along = (k - count) * step
-            before += colour * _sampled(
+            before += weights.colour * _sampled(
                 odds, pixels[i, 0] + along * normals[i, 0], pixels[i, 1] + along * normals[i, 1]
             )
         total = first = second = 0.0
@@ -182,8 +162,8 @@ def _shifts(
         # A shift beyond the search distance is not a measurement.
         inner = 1.0 - (sums[0] + sums[len(sums) - 1]) / total
         information = 1.0 / (variance + floor) - CHANCE / (unknown + floor)
-        shifts[i, 0] = mean
-        shifts[i, 1] = max(0.0, information) * inner * inner
+        shifts.mean[i] = mean
+        shifts.information[i] = max(0.0, information) * inner * inner
 
 
 @compiled()
