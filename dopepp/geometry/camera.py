@@ -13,7 +13,6 @@ from jaxtyping import Float, UInt8
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.rotation import (
-    RotationMatrix,
     Vector,
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
@@ -35,10 +34,12 @@ def transform(T_a_b: Transform, points_b: Points) -> Points:
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
-def make_transform(rotation: RotationMatrix, translation: Vector) -> Transform:
-    """Assemble a 4×4 rigid transform from a rotation and a translation (metres)."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation, translation
+def make_transform(
+    rotation: Float[np.ndarray, "*batch 3 3"], translation: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Assemble 4×4 rigid transforms from rotations and translations (metres)."""
+    T = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
     return T
 
 
@@ -48,10 +49,12 @@ def invert_transform(T_a_b: Transform) -> Transform:
     return make_transform(rotation, -rotation @ T_a_b[:3, 3])
 
 
-def move_pose(T_cam_obj: Transform, step: Step) -> Transform:
-    """Rotate a pose about the object's origin and shift it, both in camera axes."""
-    R = rotation_vector_to_matrix(step[:3])
-    return make_transform(R @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
+def move_pose(
+    T_cam_obj: Float[np.ndarray, "*batch 4 4"], step: Float[np.ndarray, "*batch 6"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Rotate poses about the object's origin and shift them, both in camera axes."""
+    R = rotation_vector_to_matrix(step[..., :3]) @ T_cam_obj[..., :3, :3]
+    return make_transform(R, T_cam_obj[..., :3, 3] + step[..., 3:])
 
 
 def rotation_lever(offset: Vector) -> Float[np.ndarray, "6 6"]:

@@ -267,18 +267,21 @@ class _Starts:
             kept = _selections(len(self.rays), len(self._steps))
             steps = np.full((len(kept), 6), np.nan)
             for step, rows in zip(steps, kept, strict=True):
-                with suppress(cv2.error):  # OpenCV 5 raises on coincident points
-                    solved, vector, move = cv2.solvePnP(
-                        self.object_points[rows],
-                        self.rays[rows],
-                        np.eye(3),
-                        None,
-                        flags=cv2.SOLVEPNP_SQPNP,
-                    )
-                    if solved:
-                        step[:3], step[3:] = vector[:, 0], move[:, 0]
+                step[:] = sqpnp(self.object_points[rows], self.rays[rows], np.eye(3))
             self._steps.append(steps)
         return self._steps[left_out]
+
+
+def sqpnp(
+    object_points: Float[np.ndarray, "n 3"], image_points: Float[np.ndarray, "n 2"], K: CameraMatrix
+) -> Float[np.ndarray, "6"]:
+    """Return the closed-form pose (rotation vector, translation); NaN for a failure."""
+    with suppress(cv2.error):  # OpenCV 5 raises on coincident points
+        flags = cv2.SOLVEPNP_SQPNP
+        solved, vector, move = cv2.solvePnP(object_points, image_points, K, None, flags=flags)
+        if solved:
+            return np.concatenate([vector[:, 0], move[:, 0]])
+    return np.full(6, np.nan)
 
 
 @cache

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
+from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import Vector, rotation_angle, rotation_vector_to_matrix
 
 MAX_FINITE: Final = 60
@@ -67,9 +68,7 @@ def rotations_about(
     centre: Vector, rotations: Float[np.ndarray, "rotations 3 3"]
 ) -> Float[np.ndarray, "rotations 4 4"]:
     """Return rotations about a point (metres) as rigid transforms."""
-    transforms = np.tile(np.eye(4), (len(rotations), 1, 1))
-    transforms[:, :3, :3], transforms[:, :3, 3] = rotations, centre - rotations @ centre
-    return transforms
+    return make_transform(rotations, centre - rotations @ centre)
 
 
 def _ball_rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:

@@ -328,10 +328,7 @@ class TemplateDetector:
         axes *= (np.arcsin(sines) / np.maximum(np.linalg.norm(axes, axis=1), 1e-12))[:, None]
         rolled = rotation_vector_to_matrix(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
         rotations = rotation_vector_to_matrix(axes) @ rolled @ self._templates.rotations[views]
-        shifts = depths[:, None] * rays - rotations @ self._centre
-        transforms = np.tile(np.eye(4), (len(poses), 1, 1))
-        transforms[:, :3, :3], transforms[:, :3, 3] = rotations, shifts
-        return transforms
+        return make_transform(rotations, depths[:, None] * rays - rotations @ self._centre)
 
 
 def _concatenate(groups: Sequence[Matches]) -> Matches:

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, write_file
@@ -243,36 +242,11 @@ def board_pose(detection: BoardDetection, camera: Camera) -> BoardPose:
     rotation, shift = poses[errors.index(error)]
     T = make_transform(cv2.Rodrigues(rotation)[0], shift.ravel())
     noise = max(PIXEL_NOISE**2, error / max(1, 2 * len(points) - 6))
-    jacobian = _pose_jacobian(points, T, camera)
+    # The derivatives by a rotation of the rotated points are those of a step of `move_pose`.
+    jacobian = cv2.projectPoints(points @ T[:3, :3].T, np.zeros(3), T[:3, 3], *lens)[1][:, :6]
     covariance = np.linalg.inv(jacobian.T @ jacobian) * noise
     distance = float((T[:3, :3] @ points.mean(axis=0) + T[:3, 3])[2])
     return BoardPose(detection.name, T, covariance, distance)
-
-
-def _pose_jacobian(
-    points: Float[np.ndarray, "n 3"], T: Transform, camera: Camera
-) -> Float[np.ndarray, "m 6"]:
-    """Return the derivative of the projected points (px) with respect to `displace`'s step."""
-
-    def projection(step: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m"]:
-        moved = displace(T[None], step[None])[0]
-        pose = cv2.Rodrigues(moved[:3, :3])[0], moved[:3, 3]
-        return np.ravel(cv2.projectPoints(points, *pose, camera.K, camera.coefficients)[0])
-
-    steps = np.diag([1e-5] * 3 + [1e-6] * 3)
-    columns = [(projection(step) - projection(-step)) / (2 * step.max()) for step in steps]
-    return np.stack(columns, axis=1)
-
-
-def displace(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
-    """Rotate (rotation vector, radians) and translate (metres) poses in parent axes.
-
-    The rotation is about each pose's origin.
-    """
-    moved = T.copy()
-    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
-    moved[:, :3, 3] += step[:, 3:]
-    return moved
 
 
 def draw_view(

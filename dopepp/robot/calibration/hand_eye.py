@@ -27,9 +27,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform, invert_transform, make_transform
+from dopepp.geometry.camera import Transform, invert_transform, make_transform, move_pose
 from dopepp.geometry.rotation import nearest_rotation
-from dopepp.robot.calibration.board import BoardPose, Transforms, displace
+from dopepp.robot.calibration.board import BoardPose, Transforms
 
 Mount = Literal["hand", "bench"]
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
@@ -155,12 +155,12 @@ def refine(
     whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, B_cov, robot)))
 
     def residuals(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, "numbers"]:
-        moved = displace(np.stack([X, Y]), step.reshape(2, 6))
+        moved = move_pose(np.stack([X, Y]), step.reshape(2, 6))
         return np.asarray((whitening @ _residuals(M, B, *moved)[..., None]).ravel())
 
     scale = np.tile(np.repeat([1e-3, 1e-3], 3), 2)
     solution = least_squares(residuals, np.zeros(12), x_scale=scale, loss="soft_l1", f_scale=3.0)
-    X, Y = displace(np.stack([X, Y]), solution.x.reshape(2, 6))
+    X, Y = move_pose(np.stack([X, Y]), solution.x.reshape(2, 6))
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)[:6, :6]
     to_cam = np.kron(np.eye(2), X[:3, :3])

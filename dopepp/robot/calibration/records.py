@@ -24,8 +24,8 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, read_limited, write_file
 from dopepp.core.json import read_json
 from dopepp.core.yaml import read_yaml
-from dopepp.geometry.camera import Transform
-from dopepp.geometry.rotation import is_rigid
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.transform_file import parse_transform
 from dopepp.parts.part import UNITS
 
 ROTATIONS: Final = {
@@ -77,9 +77,7 @@ class RobotPoses:
             rotations = Rotation.from_matrix(numbers.reshape(-1, 3, 3))
         else:
             rotations = Rotation.from_euler("xyz", numbers, degrees=degrees)
-        T = np.tile(np.eye(4), (len(self.names), 1, 1))
-        T[:, :3, :3] = rotations.as_matrix()
-        T[:, :3, 3] = self.positions * UNITS[pose_format.unit]
+        T = make_transform(rotations.as_matrix(), self.positions * UNITS[pose_format.unit])
         return np.linalg.inv(T) if pose_format.inverted else T
 
 
@@ -105,7 +103,13 @@ def read_robot_poses(path: Path) -> RobotPoses:
         next((str(record[key]) for key in NAMES if record.get(key)), "") for record in records
     )
     if "matrix" in records[0]:
-        T = np.stack([_matrix(record, row, path) for row, record in enumerate(records, 1)])
+        matrices = ({"matrix": record.get("matrix")} for record in records)
+        T = np.stack(
+            [
+                parse_transform(matrix, f"{path}, pose {row}", ROUNDED)
+                for row, matrix in enumerate(matrices, 1)
+            ]
+        )
         rotations = T[:, :3, :3].reshape(-1, 9)
         return RobotPoses(names, T[:, :3, 3], "matrix", rotations, str(path))
     fields = {str(field).strip().lower() for field in records[0]}
@@ -177,19 +181,6 @@ def _numbers(
     return np.array(
         [[number(record, key, row) for key in keys] for row, record in enumerate(records, 1)]
     )
-
-
-def _matrix(record: Record, row: int, path: Path) -> Transform:
-    """Return a record's 4×4 ``matrix``; raise a ``UserError`` if it is no rigid transform."""
-    try:
-        T = np.array(record["matrix"], np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError):
-        T = np.zeros((4, 4))
-    if not is_rigid(T, ROUNDED):
-        problem = f"{path}, pose {row}: matrix={record.get('matrix')!r:.80}"
-        allowed = "4×4 numbers of a rigid transform, row by row"
-        raise UserError(problem, allowed, "write the 16 numbers, or delete that pose")
-    return T
 
 
 def match_images(poses: RobotPoses, images: Sequence[str]) -> dict[str, int]:

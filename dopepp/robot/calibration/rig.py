@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Transform, invert_transform, transform
+from dopepp.geometry.camera import Transform, invert_transform, move_pose, transform
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import (
     PIXEL_NOISE,
@@ -26,7 +26,6 @@ from dopepp.robot.calibration.board import (
     BoardPose,
     Transforms,
     board_pose,
-    displace,
 )
 from dopepp.robot.calibration.lens import MAX_ERROR_PX, MIN_OUTLIER_PX, OUTLIER
 
@@ -191,7 +190,7 @@ class _Adjustment:
                     sparsity[ends[number] : ends[number + 1], 6 * unknown : 6 * unknown + 6] = 1
 
         def move(step: Float[np.ndarray, "numbers"]) -> Transforms:
-            return np.concatenate([start[:1], displace(start[1:], step.reshape(-1, 6))])
+            return np.concatenate([start[:1], move_pose(start[1:], step.reshape(-1, 6))])
 
         def errors(step: Float[np.ndarray, "numbers"]) -> Float[np.ndarray, "numbers"]:
             return np.concatenate(self._residuals(move(step))).ravel()
