@@ -71,13 +71,12 @@ class PosedImage:
         lever = rotation_lever(position)  # from a rotation about the camera's centre
         return np.asarray(lever @ self.error @ lever.T)
 
-    def to_world(
-        self, T_cam_obj: Transform, covariance: PoseMatrix
-    ) -> tuple[Transform, PoseMatrix]:
+    def to_world(self, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
         """Convert pose and covariance to the world; add the error of the camera's pose."""
-        R = self.T_cam_world[:3, :3]
         T_world_obj = np.linalg.inv(self.T_cam_world) @ T_cam_obj
-        return T_world_obj, rotate_covariance(R.T, covariance + self.error_at(T_cam_obj[:3, 3]))
+        both = covariance + self.error_at(T_cam_obj[:3, 3])
+        in_world = rotate_covariance(self.T_cam_world[:3, :3].T, both)
+        return Prior(T_world_obj, np.linalg.inv(in_world))
 
     def to_camera(self, T_world_obj: Transform, covariance: PoseMatrix) -> Prior:
         """Convert pose and covariance to the camera frame; add the error of the camera's pose."""

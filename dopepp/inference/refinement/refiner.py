@@ -37,7 +37,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.geometry.pnp import solve_pnp
+from dopepp.geometry.pnp import solve_pnp, sqpnp
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.network_input import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
@@ -176,8 +176,10 @@ class Refiner:
         prior: Prior,
         followed: bool = False,
     ) -> JointRefinement:
-        """Refine the pose of a part in the world; see :meth:`PartRefiner.refine_views`."""
-        return self._refiners[name].refine_views(views, start, prior, followed)
+        """Refine the pose of a part in the world; see :func:`.joint_refinement.refine_views`."""
+        part = self._refiners[name]
+        assert part.region is not None  # the caller requires the term ``region``
+        return refine_views(part.region, views, start, prior, part.surface, followed)
 
     def verified(
         self, detection: Detection, image: RGBImage, K: CameraMatrix, moved: float = 0.0
@@ -223,31 +225,8 @@ class PartRefiner:
             self.verifier = Verifier(self.region.mesh, part.diameter)
         self._uses_depth, self._diameter = "depth" in terms, part.diameter
         has_surface = self._uses_depth and len(part.points) >= MIN_POINTS
-        self._surface = surface_points(part.points) if has_surface else None
-
-    def refine_views(
-        self,
-        views: Sequence[PosedImage],
-        start: Prior,
-        prior: Prior,
-        followed: bool = False,
-    ) -> JointRefinement:
-        """Refine a pose in the world on several images.
-
-        Args:
-            views: Images with the poses of their cameras.
-            start: Pose in the world from which the search starts; its information limits the
-                search.
-            prior: Distribution of the pose before the images' outlines are used.
-            followed: Whether the part was refined on the previous images.
-
-        Raises:
-            UndecidedError: The images do not determine the pose.
-        """
-        if self.region is None:
-            raise UndecidedError("several views are refined only with refine=region")
-        surface = self._surface if self._uses_depth else None
-        return refine_views(self.region, views, start, prior, surface, followed)
+        self.surface = surface_points(part.points) if has_surface else None
+        """Surface points; None without the term ``depth``, or if the part has too few points."""
 
     def refine(
         self,
@@ -283,10 +262,10 @@ class PartRefiner:
         try:
             if depth is None:
                 raise UndecidedError("no depth image was given")
-            if self._surface is None:
+            if self.surface is None:
                 raise UndecidedError("the part has too few surface points")
             prior = make_prior(given, self._diameter, covariance)
-            evidence = DepthEvidence(self._surface, self._diameter, depth, K, prior)
+            evidence = DepthEvidence(self.surface, self._diameter, depth, K, prior)
             if self.region is None or by_image is None:
                 return _checked(evidence, evidence.descend())
             return _refine_with_both(self.region, image, K, by_image, evidence)
@@ -363,14 +342,9 @@ def poses_of_four(
     poses = []
     for number in order:
         four = list(quadruples[number])
-        try:
-            solved, rotation, shift = cv2.solvePnP(
-                cuboid[four], peaks[four], K, None, flags=cv2.SOLVEPNP_SQPNP
-            )
-        except cv2.error:  # all four keypoints have the same pixel
-            continue
-        if solved and np.isfinite(rotation).all() and shift[2, 0] > 0:
-            poses.append(make_transform(rotation_vector_to_matrix(rotation[:, 0]), shift[:, 0]))
+        pose = sqpnp(cuboid[four], peaks[four], K)
+        if np.isfinite(pose).all() and pose[5] > 0:
+            poses.append(make_transform(rotation_vector_to_matrix(pose[:3]), pose[3:]))
     return poses
 
 

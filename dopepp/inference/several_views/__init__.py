@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -86,8 +85,31 @@ def joint_estimator(
         problem = f"several views with refine={estimator.refine}"
         raise UserError(problem, "refine='region', or region and depth", fix)
     names = names or [f"view {number}" for number in range(len(images))]
-    error = CAMERA_ERROR if camera_error is None else camera_error
-    views = _posed_images(images, cameras, T_world_cam, depths, error, names)
+    shift, rotation_error = (
+        check(f"camera_error[{n}]", error, float, Range(0.0, 1.0))
+        for n, error in enumerate(CAMERA_ERROR if camera_error is None else camera_error)
+    )
+    error = np.diag(np.repeat([rotation_error, shift], 3) ** 2)
+    count = len(images)
+    lengths = {"cameras": cameras, "T_world_cam": T_world_cam, "depths": depths, "names": names}
+    for name, values in lengths.items():
+        if values is not None and len(values) != count:
+            problem = f"{len(values)} {name} for {count} images"
+            raise UserError(problem, f"{count}, one for each image", f"pass {count} {name}")
+    views = []
+    for number, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        if isinstance(camera, Camera):
+            resized = camera.for_picture((image.shape[1], image.shape[0]))
+            K, distortion = resized.K, resized.coefficients
+        else:
+            K, distortion = camera, None
+        depth = None if depths is None else depths[number]
+        image, K, depth = prepare_image(image, K, distortion, depth)
+        T = np.asarray(T_world_cam[number], np.float64)
+        if not is_rigid(T):
+            problem = f"T_world_cam of {names[number]}: {T.tolist()!s:.200}"
+            raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
+        views.append(PosedImage(image, K, invert_transform(T), error, depth))
     geometries = {part.name: PartGeometry.of(part) for part in estimator.solid_parts}
     slope = estimator.recovery.refined_verification
     return JointEstimator(refiner, views, names, geometries, slope)
@@ -109,18 +131,15 @@ def search(
     """
     before = dict(estimator.spent_ms)
     observations, maps = _observations(estimator, joint.views, distances, regions)
-    associated, least = partial(associate, geometries=joint.geometries), estimator.min_score
+    least = estimator.min_score
     with estimator.timed("refine"):
         in_maps = JointSearch(estimator, joint.views, maps)
-        parts = [part.detection for part in joint.parts(associated(observations), in_maps)]
+        parts = [
+            part.detection
+            for part in joint.parts(associate(observations, joint.geometries), in_maps)
+        ]
     strong = [[item for item in view if item.detection.score >= least] for view in observations]
-    passed, findings = contradictions(
-        [part for part in parts if part.score >= least],
-        strong,
-        joint.views,
-        joint.names,
-        associated,
-    )
+    passed, findings = contradictions([p for p in parts if p.score >= least], strong, joint)
     weaker = [part for part in parts if part not in passed]
     return views_result(estimator, joint, passed, findings, weaker, before)
 
@@ -163,43 +182,6 @@ def views_result(
         given = view.image, view.K, detections, speed, name, number, None, numbers, shapes
         results.append(PoseResult(*given))
     return ViewsResult(parts, findings, results, weaker, identities, velocities)
-
-
-def _posed_images(
-    images: Sequence[RGBImage],
-    cameras: Sequence[Camera | CameraMatrix],
-    T_world_cam: Sequence[Transform],
-    depths: Sequence[Depth] | None,
-    camera_error: tuple[float, float],
-    names: Sequence[str],
-) -> list[PosedImage]:
-    """Check the arguments of all views, and return the images without lens distortion."""
-    count = len(images)
-    lengths = {"cameras": cameras, "T_world_cam": T_world_cam, "depths": depths, "names": names}
-    for name, values in lengths.items():
-        if values is not None and len(values) != count:
-            problem = f"{len(values)} {name} for {count} images"
-            raise UserError(problem, f"{count}, one for each image", f"pass {count} {name}")
-    shift, rotation_error = (
-        check(f"camera_error[{n}]", error, float, Range(0.0, 1.0))
-        for n, error in enumerate(camera_error)
-    )
-    error = np.diag(np.repeat([rotation_error, shift], 3) ** 2)
-    views = []
-    for number, (image, camera) in enumerate(zip(images, cameras, strict=True)):
-        if isinstance(camera, Camera):
-            resized = camera.for_picture((image.shape[1], image.shape[0]))
-            K, distortion = resized.K, resized.coefficients
-        else:
-            K, distortion = camera, None
-        depth = None if depths is None else depths[number]
-        image, K, depth = prepare_image(image, K, distortion, depth)
-        T = np.asarray(T_world_cam[number], np.float64)
-        if not is_rigid(T):
-            problem = f"T_world_cam of {names[number]}: {T.tolist()!s:.200}"
-            raise UserError(problem, "a rigid 4×4 transform", "pass the camera's pose in the world")
-        views.append(PosedImage(image, K, invert_transform(T), error, depth))
-    return views
 
 
 def _observations(

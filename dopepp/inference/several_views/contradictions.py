@@ -11,7 +11,7 @@ camera pose are rejected. If the views agree on another part, the contradicting 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, product
 from typing import Final, NamedTuple
@@ -19,10 +19,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dopepp.geometry.rotation import rotation_angle
-from dopepp.inference.refinement.joint_refinement import PosedImage
-from dopepp.inference.several_views.joint import CONSISTENT
+from dopepp.inference.several_views.joint import CONSISTENT, JointEstimator
 from dopepp.inference.several_views.observations import (
     PartObservation,
+    associate,
     make_observation,
     separation,
 )
@@ -33,7 +33,6 @@ DISAGREEING: Final = 1.2
 poses, the largest of 30 disagreements on rendered scenes was 0.9."""
 
 Views = Sequence[Sequence[PartObservation]]  # observations of each view
-Associate = Callable[[Views], list[list[PartObservation]]]
 
 
 class _Conflict(NamedTuple):
@@ -53,25 +52,19 @@ class _Conflict(NamedTuple):
 
 
 def contradictions(
-    detections: Sequence[WorldDetection],
-    observations: Views,
-    images: Sequence[PosedImage],
-    names: Sequence[str],
-    associated: Associate,
+    detections: Sequence[WorldDetection], observations: Views, joint: JointEstimator
 ) -> tuple[list[WorldDetection], list[str]]:
     """Find contradictions between views, and reject detections that depend on a wrong camera pose.
 
     Args:
         detections: Detections in the world with at least the minimum score.
         observations: Observations of each view with at least the minimum score.
-        images: Images with the poses of their cameras.
-        names: Name of each view.
-        associated: Function that groups the observations of several views by part.
+        joint: Estimator of joint poses on the views.
 
     Returns:
         Detections that no contradiction rejects, and a message for each contradiction.
     """
-    supports = [_support(detection) for detection in detections]
+    names, supports = joint.names, [_support(detection) for detection in detections]
     confirmed = {pair for views in supports for pair in combinations(views, 2)}
     trusted = {view for pair in confirmed for view in pair}
     findings: list[str] = []
@@ -90,7 +83,7 @@ def contradictions(
         blamed = [n for n in (0, 1) if views[n] not in trusted]
         blamed = blamed if len(blamed) == 1 else [0, 1]
         rejected += [conflict.detections[number] for number in blamed]
-        swapped = swapped or _swapped(observations, images, associated)
+        swapped = swapped or _swapped(observations, joint)
         if len(blamed) == 1:
             cause = f"the camera pose of {names[views[blamed[0]]]} is wrong"
         else:
@@ -132,10 +125,9 @@ def _conflict(first: WorldDetection, second: WorldDetection) -> _Conflict | None
     return max(conflicts, key=lambda conflict: conflict.is_mutual, default=None)
 
 
-def _swapped(
-    observations: Views, images: Sequence[PosedImage], associated: Associate
-) -> tuple[int, int] | None:
+def _swapped(observations: Views, joint: JointEstimator) -> tuple[int, int] | None:
     """Return the two views whose swapped camera poses associate most observations, or None."""
+    images = joint.views
 
     def agreeing(order: Sequence[int]) -> int:
         views = [
@@ -146,7 +138,8 @@ def _swapped(
             [make_observation(item.view, item.detection, views[item.view]) for item in view]
             for view in observations
         ]
-        return sum(len(cluster) - 1 for cluster in associated(moved_observations))
+        clusters = associate(moved_observations, joint.geometries)
+        return sum(len(cluster) - 1 for cluster in clusters)
 
     order = list(range(len(images)))
     exchanged = {}

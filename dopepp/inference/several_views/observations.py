@@ -20,7 +20,7 @@ from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.refinement.refiner import INFLATION
-from dopepp.inference.refinement.solver import PoseMatrix, Prior
+from dopepp.inference.refinement.solver import Prior
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
@@ -78,20 +78,14 @@ class PartObservation:
 
 def make_observation(view: int, detection: Detection, image: PosedImage) -> PartObservation:
     """Return the observation in the world for a detection in the view with index ``view``."""
-    pose = _in_world(image, detection.T_cam_obj, detection.covariance)
+    pose = image.to_world(detection.T_cam_obj, detection.covariance)
     assert detection.start is not None
-    start = _in_world(image, *detection.start)
+    start = image.to_world(*detection.start)
     # The expected squared distance of a six-dimensional error is 6.
     surprise = max(1.0, start.squared_distance(pose.T_cam_obj) / 6)
     return PartObservation(
         view, detection, pose, Prior(start.T_cam_obj, start.information / surprise)
     )
-
-
-def _in_world(image: PosedImage, T_cam_obj: Transform, covariance: PoseMatrix) -> Prior:
-    """Return a pose in the world; the camera pose's error is added to the covariance."""
-    T_world_obj, in_world = image.to_world(T_cam_obj, covariance)
-    return Prior(T_world_obj, np.linalg.inv(in_world))
 
 
 def separation(first: Prior, second: Prior) -> float:
