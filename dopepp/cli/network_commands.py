@@ -124,16 +124,16 @@ def doctor(
     from dopepp.inference.diagnosis import Case, Diagnosis, diagnose
     from dopepp.parts.catalogue import with_meshes
 
-    estimator = options.load_estimator(model, device, unit, working_distance, tilt, parts)
-    solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
-    estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
-    positions = shown_at if centres or empty else None
     try:
         undistorted = lens.undistort(pixels)
-        case = Case(estimator, *undistorted, solid_parts, distance, crop is not None, positions)
     except UserError as error:
         findings = [Diagnosis("camera", f"{error.got}; allowed: {error.allowed}", error.fix)]
     else:
+        estimator = options.load_estimator(model, device, unit, working_distance, tilt, parts)
+        solid_parts = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
+        estimator = estimator if refine is None else estimator.refining(refine, solid_parts)
+        positions = shown_at if centres or empty else None
+        case = Case(estimator, *undistorted, solid_parts, distance, crop is not None, positions)
         findings = diagnose(case)
     findings.sort(key=lambda finding: not finding.fix)
     for finding in findings:

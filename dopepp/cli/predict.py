@@ -123,6 +123,10 @@ def predict(
         sources = [opened for group in words for opened in open_sources(group, topic)]
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         cameras = [] if views else [choose_camera(K, camera, opened) for opened in sources]
+        for opened, its_camera in zip(sources, cameras, strict=False):
+            if opened.rate is None:  # refuse K of another image size before the model is loaded
+                first = next(opened.frames()).image
+                its_camera.for_picture((first.shape[1], first.shape[0]), K_size, crop)
 
         from dopepp.parts.catalogue import with_meshes
 

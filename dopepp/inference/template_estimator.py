@@ -7,7 +7,7 @@ and score.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -63,6 +63,9 @@ SCALE_ERROR: Final = 0.001
 """Default of ``scale_error``. It is small, so that refinement corrects the distance, because
 templates determine the distance only roughly."""
 
+RefineOnce = Callable[[Sequence[Detection]], list[Detection]]
+"""Returns detections after a single refinement on the image."""
+
 
 class TemplateEstimator(PoseEstimator):
     """Estimates the poses of parts from their meshes alone.
@@ -87,6 +90,7 @@ class TemplateEstimator(PoseEstimator):
         scale_error: float | None = None,
     ) -> None:
         self.detectors, self.distances = tuple(detectors), distances
+        self._detector_of = {detector.part.name: detector for detector in detectors}
         self.max_ms = max_ms
         self.scale_error = SCALE_ERROR if scale_error is None else scale_error
         self.levels: dict[str, float] = {}
@@ -183,24 +187,25 @@ class TemplateEstimator(PoseEstimator):
         """
         if any(start.agreement is not None for start in detections):
             return super().refined(detections, image, K, depth)
+        refine = partial(self._refined_once, image=image, K=K, depth=depth)
         if self.max_ms is not None:
-            return self._refined_once(detections, image, K, depth)
+            return refine(detections)
         ends: list[Detection] = []
         for detector in self.detectors:
+            again = partial(_refined_again, detector, K=K, refine=refine)
             starts = [start for start in detections if start.object == detector.part.name]
-            best = self._most_promising(starts, image, K)
-            poses = sorted(
-                self._refined_once(best, image, K, depth), key=_probability, reverse=True
-            )
+            poses = refine(self._most_promising(starts, image, K))
+            poses.sort(key=_probability, reverse=True)
             chosen = distinct_poses([pose.T_cam_obj for pose in poses], detector.part)
-            group = [
-                self._refined_again(detector, poses[number], image, K, depth)
-                if rank < NUM_REPEATED
-                else poses[number]
-                for rank, number in enumerate(chosen)
-            ]
-            group += self._half_turned(detector, group, image, K, depth)
-            ends += self._without_look_alikes(detector, group, image, K)
+            group = [poses[number] for number in chosen]
+            if not group:
+                continue
+            group[:NUM_REPEATED] = map(again, group[:NUM_REPEATED])
+            best = max(group, key=_probability)
+            turned = detector.half_turned(best.T_cam_obj)
+            starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
+            group += map(again, refine(starts))
+            ends += self._without_look_alikes(group, image, K)
         return ends
 
     def _refined_once(
@@ -215,9 +220,8 @@ class TemplateEstimator(PoseEstimator):
         Small silhouettes resemble many objects: a plate seen edge-on fits every stick, and a part
         that is cut off by the border of the image fits many corners.
         """
-        detectors = {detector.part.name: detector for detector in self.detectors}
         ends = super().refined(detections, image, K, depth)
-        areas = [detectors[end.object].silhouette(end.T_cam_obj, image, K) for end in ends]
+        areas = [self._detector_of[end.object].silhouette(end.T_cam_obj, image, K) for end in ends]
         return [
             replace(end, probability=to_probability(log_odds(_probability(end)) + math.log(area)))
             for end, area in zip(ends, areas, strict=True)
@@ -240,53 +244,14 @@ class TemplateEstimator(PoseEstimator):
         order = dict.fromkeys(np.column_stack([by_score, by_fit]).ravel().tolist())
         return [starts[index] for index in list(order)[:NUM_REFINED]]
 
-    def _refined_again(
-        self,
-        detector: TemplateDetector,
-        end: Detection,
-        image: RGBImage,
-        K: CameraMatrix,
-        depth: Depth | None,
-    ) -> Detection:
-        """Refine a pose again while its probability increases, at most ``REPEATS`` times."""
-        for _ in range(REPEATS):
-            start = detector.start(end.T_cam_obj, end.score, K)
-            (new,) = self._refined_once([start], image, K, depth)
-            if new.kept or _probability(new) <= _probability(end):
-                break
-            end = new
-        return end
-
-    def _half_turned(
-        self,
-        detector: TemplateDetector,
-        ends: Sequence[Detection],
-        image: RGBImage,
-        K: CameraMatrix,
-        depth: Depth | None,
-    ) -> list[Detection]:
-        """Refine the best pose after half turns.
-
-        See :meth:`TemplateDetector.half_turned`.
-        """
-        if not ends:
-            return []
-        best = max(ends, key=_probability)
-        turned = detector.half_turned(best.T_cam_obj)
-        starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
-        poses = self._refined_once(starts, image, K, depth)
-        return [self._refined_again(detector, pose, image, K, depth) for pose in poses]
-
     def _without_look_alikes(
-        self, detector: TemplateDetector, ends: list[Detection], image: RGBImage, K: CameraMatrix
+        self, ends: list[Detection], image: RGBImage, K: CameraMatrix
     ) -> list[Detection]:
         """Remove poses of the best pose's instance, except the one whose distinctive lines fit.
 
         Poses are compared if they belong to one instance, and have similar probabilities and very
         different rotations, e.g. half turns. See :meth:`Verifier.prefers`.
         """
-        if not ends:
-            return []
         assert self.refiner is not None  # templates are always refined
         ends = sorted(ends, key=_probability, reverse=True)
         best, least = ends[0], log_odds(_probability(ends[0])) - MAX_DIFFERENCE
@@ -342,6 +307,18 @@ class TemplateEstimator(PoseEstimator):
             UserError: Templates have no checkpoint.
         """
         raise _networks_only("a checkpoint")
+
+
+def _refined_again(
+    detector: TemplateDetector, end: Detection, K: CameraMatrix, refine: RefineOnce
+) -> Detection:
+    """Refine a pose again while its probability increases, at most ``REPEATS`` times."""
+    for _ in range(REPEATS):
+        (new,) = refine([detector.start(end.T_cam_obj, end.score, K)])
+        if new.kept or _probability(new) <= _probability(end):
+            break
+        end = new
+    return end
 
 
 def _check_size(part: Part, distances: tuple[float, float]) -> None:

@@ -142,8 +142,8 @@ def arrange_floating(
 ) -> float:
     """Add targets and distractors to a composition, and return the targets' mean depth, metres.
 
-    If no pose of the first target is accepted, no target is added. Without targets, the depth is a
-    sampled depth of ``reference_body``.
+    Depths are those of the centres of bounding boxes. If no pose of the first target is accepted,
+    no target is added. Without targets, the depth is a sampled depth of ``reference_body``.
     """
     for body in targets:
         material = composition.draw_material(body)
@@ -153,9 +153,10 @@ def arrange_floating(
                 break
         if not composition.objects:
             break
-    depths = [float(item.T_cam_obj[2, 3]) for item in composition.objects]
+    depths = [float(item.centre[2]) for item in composition.objects]
     if not depths:
-        depths = [max(float(_draw_pose(composition, reference_body)[2, 3]), NEAR)]
+        pose = _draw_pose(composition, reference_body)
+        depths = [max(float(transform(pose, reference_body.surface.centre)[2]), NEAR)]
     low, high = composition.preset.distractors.number
     for _ in range(int(composition.rng.integers(low, high + 1))):
         _place_distractor(composition, depths[0])
@@ -193,10 +194,10 @@ def _place_distractor(composition: Composition, reference: float) -> None:
     for _ in range(8):
         depth = reference * rng.uniform(*ranges.depth)
         pixel = rng.uniform(0, 1, 2) * composition.size - 0.5
-        pose = make_transform(
-            random_rotation(rng), depth * np.linalg.solve(composition.K, [*pixel, 1.0])
-        )
+        rotation = random_rotation(rng)
         body = composition.draw_distractor(depth)
+        position = depth * np.linalg.solve(composition.K, [*pixel, 1.0])
+        pose = make_transform(rotation, position - rotation @ body.surface.centre)
         if not _is_clear(composition, body, pose):
             continue
         if composition.add(body, pose, composition.draw_material(body)):
@@ -205,9 +206,9 @@ def _place_distractor(composition: Composition, reference: float) -> None:
 
 def _is_clear(composition: Composition, body: Body, T_cam_obj: Transform) -> bool:
     """Return whether all targets lie outside 60 % of the new object's bounding radius."""
-    centre, core = T_cam_obj[:3, 3], 0.6 * body.surface.radius
+    centre, core = transform(T_cam_obj, body.surface.centre), 0.6 * body.surface.radius
     for target in composition.objects:
-        distance = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))
+        distance = float(np.linalg.norm(target.centre - centre))
         if target.part is None or distance > core + target.surface.radius:
             continue
         probes = target.part.points[:: max(len(target.part.points) // 200, 1)]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16
 
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
+from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints, transform
 from dopepp.geometry.rotation import RotationMatrix, Vector
 from dopepp.parts.part import Part
 from dopepp.virtual.sensor import Sensor
@@ -148,6 +148,11 @@ class SceneObject:
     T_cam_obj: Transform
     material: Material = field(default_factory=Material)
     part: Part | None = None
+
+    @property
+    def centre(self) -> Vector:
+        """Centre of the bounding box, camera frame, metres."""
+        return transform(self.T_cam_obj, self.surface.centre)
 
     @property
     def is_target(self) -> bool:

@@ -116,6 +116,14 @@ def test_wrong_options_of_single_commands_are_one_line(refused, truth):
         assert message in refused(*words)
 
 
+def test_K_of_another_size_is_refused_before_the_mesh_is_read(run, refused, truth, monkeypatch):
+    monkeypatch.setattr("dopepp.inference.template_estimator.load_solid_part", None)
+    words = ("--K", 2000, 2000, 1999.5, 1499.5, "--unit", "mm", *RANGE)
+    assert "K with fx=2000" in refused("predict", "piv.stl", "part.png", *words)
+    done = run("doctor", "part.png", "--model", "piv.stl", *words, code=1)
+    assert done.stdout.startswith("!! camera: K with fx=2000")
+
+
 def test_the_page_shows_poses_without_maps(truth, folder, rendered):
     pytest.importorskip("gradio", reason="without the extra web")
     from dopepp import PoseEstimator

@@ -94,12 +94,11 @@ def test_distinctive_lines_decide_between_equally_probable_poses(near_truth, est
         replace(detector.start(pose, 0.5, K), probability=probability)
         for pose, probability in zip(poses, (0.9, 0.85, 0.8), strict=True)
     ]
-    kept = estimator._without_look_alikes(detector, ends, image, K)
+    kept = estimator._without_look_alikes(ends, image, K)
     assert [id(end) for end in kept] == [id(ends[1]), id(ends[2])]
     ends[1] = replace(ends[1], probability=0.5)  # too improbable to be compared
-    kept = estimator._without_look_alikes(detector, ends, image, K)
+    kept = estimator._without_look_alikes(ends, image, K)
     assert [id(end) for end in kept] == [id(ends[0]), id(ends[2])]
-    assert estimator._without_look_alikes(detector, [], image, K) == []
 
 
 def test_the_given_distances_replace_the_working_distance(estimator, rendered):

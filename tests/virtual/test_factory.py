@@ -100,6 +100,19 @@ def test_other_built_in_parts_are_among_the_distractors():
     assert 0.6 < min(radii) < max(radii) <= 1.3
 
 
+def test_a_scene_does_not_depend_on_the_origin_of_the_mesh():
+    part, offset = pivconnector(), np.array([0.5, -0.3, 0.2])
+    mesh = replace(part.mesh, vertices=part.mesh.vertices + offset)
+    parts = part, make_part(part.name, mesh)
+    factories = [Factory([it], with_distractors(lookalike_share=0.0), 0) for it in parts]
+    for index in range(3):
+        expected, moved = (factory.scene(0, index).objects for factory in factories)
+        assert len(expected) == len(moved) > 1
+        for item, other in zip(expected, moved, strict=True):
+            np.testing.assert_allclose(other.centre, item.centre, atol=1e-9)
+            np.testing.assert_allclose(other.surface.radius, item.surface.radius, rtol=1e-9)
+
+
 def test_without_lookalikes_or_other_parts_there_are_only_primitives():
     none = Factory([pivconnector()], with_distractors(lookalike_share=0.0), 0)
     assert lookalikes(none)[0] == []

@@ -58,8 +58,8 @@ class Surface:
 
     @property
     def radius(self) -> float:
-        """Largest distance of a vertex from the object frame's origin, metres."""
-        return float(np.linalg.norm(self.hull, axis=1).max())
+        """Largest distance of a vertex from the centre of the bounding box, metres."""
+        return float(np.linalg.norm(self.hull - self.centre, axis=1).max())
 
     @cached_property
     def centre(self) -> Vector:
