@@ -8,13 +8,10 @@ from pathlib import Path
 import typer
 
 from dopepp.core.errors import Interruption, UserError, interruptible
-from dopepp.core.files import IMAGES
 from dopepp.drawing.pictures import RGBImage, Size, read_photo
 from dopepp.geometry.camera_file import read_camera
 from dopepp.robot.calibration.board import Board, BoardDetection, BoardPose, board_pose, parse_board
 from dopepp.robot.calibration.lens import CHECKS_PER_S, Views
-
-SUFFIXES = (*IMAGES, ".tif", ".tiff")
 
 
 def image_names(folder: Path) -> list[str]:
@@ -23,15 +20,9 @@ def image_names(folder: Path) -> list[str]:
     Raises:
         UserError: The folder has no images.
     """
-    from dopepp.inference.frames.media import sort_paths
+    from dopepp.inference.frames.media import list_images
 
-    paths = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
-    names = [path.name for path in sort_paths(paths)]
-    if not names:
-        allowed = f"a folder with {', '.join(SUFFIXES)}"
-        fix = "pass the folder that holds the images"
-        raise UserError(f"{folder} without images", allowed, fix)
-    return names
+    return [path.name for path in list_images(folder) or ()]
 
 
 def board_poses(folder: Path, spec: str, camera: Path) -> list[BoardPose]:

@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,7 +17,6 @@ import cv2
 import numpy as np
 from jaxtyping import Int
 
-from dopepp.core.errors import UserError
 from dopepp.core.files import IMAGES, check_target, write_image
 from dopepp.drawing.overlay import (
     MIN_WIDTH_PX,
@@ -180,15 +178,8 @@ class PoseResult:
         return json.dumps(content, ensure_ascii=False, allow_nan=False)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return a table with one row per detection: position (metres), quaternion (w, x, y, z).
-
-        Raises:
-            UserError: pandas is not installed.
-        """
-        if find_spec("pandas") is None:
-            fix = "pip install pandas, or use to_json()"
-            raise UserError("to_dataframe() without pandas", "an installation with pandas", fix)
-        import pandas as pd
+        """Return a table with one row per detection: position (metres), quaternion (w, x, y, z)."""
+        import pandas as pd  # imported on demand, because it is slow to import
 
         rows = []
         for row, detection in zip(self.records(), self.detections, strict=True):

@@ -129,7 +129,7 @@ def test_a_bench_is_calibrated_from_a_board_on_it(run, refused, cell, tmp_path):
     [
         (("board", "chess:8x6:20", "--out", "b.pdf"), "one even and one odd"),
         (("board", "chess:8x5:20", "--out", "b.txt"), ".pdf"),
-        (("camera", ".", "--board", SPEC, "--out", "c.yaml"), "without images"),
+        (("camera", ".", "--board", SPEC, "--out", "c.yaml"), "without an image"),
         (("camera", ".", "--board", SPEC, "--out", "c.json"), ".yaml"),
         (("tcp", "none.csv", "--out", "t.yaml"), "none.csv"),
         (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),

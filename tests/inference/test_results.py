@@ -132,9 +132,3 @@ def test_table_contains_the_poses():
     assert table["frame"].unique().tolist() == [FRAME]
     assert list(table.columns) == list(result().to_dataframe().columns)
     assert math.isclose(table["score"][1], 0.8)
-
-
-def test_missing_pandas_is_reported(monkeypatch):
-    monkeypatch.setattr("dopepp.inference.pose_result.find_spec", lambda _: None)
-    with pytest.raises(UserError, match="pip install pandas, or use to_json"):
-        result(pose()).to_dataframe()
