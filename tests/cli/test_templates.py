@@ -116,7 +116,7 @@ def test_wrong_options_of_single_commands_are_one_line(refused, truth):
         assert message in refused(*words)
 
 
-def test_K_of_another_size_is_refused_before_the_mesh_is_read(run, refused, truth, monkeypatch):
+def test_intrinsics_of_another_size_are_refused_at_once(run, refused, truth, monkeypatch):
     monkeypatch.setattr("dopepp.inference.template_estimator.load_solid_part", None)
     words = ("--K", 2000, 2000, 1999.5, 1499.5, "--unit", "mm", *RANGE)
     assert "K with fx=2000" in refused("predict", "piv.stl", "part.png", *words)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -33,32 +34,19 @@ or out-of-focus background."""
 WHITE: Final = 250  # a pixel is clipped if all its channels reach this level
 
 
+@dataclass(frozen=True, eq=False)
 class Case:
-    """An image to diagnose, with its camera and estimator, and the detections that checks use.
+    """An image to diagnose, with its camera and estimator, and the detections that checks use."""
 
-    Args:
-        estimator: Estimator to diagnose.
-        image: RGB, without distortion.
-        K: Camera matrix.
-        parts: The estimator's parts, with meshes where available.
-        distances: Nearest and farthest depth, metres (default: the training range).
-        cropped: As in :meth:`PoseEstimator.predict`.
-        centres: Pixel of each shown part's centre; None if it is unknown which parts are shown.
-    """
-
-    def __init__(
-        self,
-        estimator: PoseEstimator,
-        image: RGBImage,
-        K: CameraMatrix,
-        parts: Sequence[Part],
-        distances: tuple[float, float] | None = None,
-        cropped: bool = False,
-        centres: Sequence[tuple[float, float]] | None = None,
-    ) -> None:
-        self.estimator, self.image, self.K = estimator, image, K
-        self.parts, self.distances, self.cropped = parts, distances, cropped
-        self.centres = centres
+    estimator: PoseEstimator  # estimator to diagnose
+    image: RGBImage  # RGB, without distortion
+    K: CameraMatrix
+    parts: Sequence[Part]  # the estimator's parts, with meshes where available
+    # Nearest and farthest depth, metres; None: the training range
+    distances: tuple[float, float] | None = None
+    cropped: bool = False  # as in :meth:`PoseEstimator.predict`
+    # Pixel of each shown part's centre; None if it is unknown which parts are shown
+    centres: Sequence[tuple[float, float]] | None = None
 
     @cached_property
     def reported(self) -> list[Detection]:

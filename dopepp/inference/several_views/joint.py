@@ -69,27 +69,15 @@ class JointPart:
     detection: WorldDetection
 
 
+@dataclass(frozen=True, eq=False)
 class JointEstimator:
-    """Estimates poses of parts in the world from all views together.
+    """Estimates poses of parts in the world from all views together."""
 
-    Args:
-        refiner: Refines and verifies poses on the image.
-        views: Images of the scene.
-        names: Name of each view.
-        geometries: Geometry of each part.
-        slope: Weight of the log odds of ``Detection.probability`` in the score.
-    """
-
-    def __init__(
-        self,
-        refiner: Refiner,
-        views: Sequence[PosedImage],
-        names: Sequence[str],
-        geometries: Mapping[str, PartGeometry],
-        slope: float,
-    ) -> None:
-        self._refiner, self.views, self.names = refiner, views, names
-        self.geometries, self._slope = geometries, slope
+    refiner: Refiner  # refines and verifies poses on the image
+    views: Sequence[PosedImage]  # images of the scene
+    names: Sequence[str]  # name of each view
+    geometries: Mapping[str, PartGeometry]  # geometry of each part
+    slope: float  # weight of the log odds of ``Detection.probability`` in the score
 
     def parts(
         self, clusters: Sequence[Sequence[PartObservation]], search: Search
@@ -149,7 +137,7 @@ class JointEstimator:
             prior = geometry.mean(starts or [observations[0].start])
             try:
                 views = [self.views[number] for number in numbers]
-                joint = self._refiner.refine_views(name, views, search_range, prior)
+                joint = self.refiner.refine_views(name, views, search_range, prior)
             except UndecidedError:
                 break
             pose = Prior(joint.T_world_obj, np.linalg.inv(joint.covariance))
@@ -214,7 +202,7 @@ class JointEstimator:
             selected = supporting
             try:
                 views = [self.views[number] for number in sorted(selected)]
-                joint = self._refiner.refine_views(part.object, views, forecast, forecast, True)
+                joint = self.refiner.refine_views(part.object, views, forecast, forecast, True)
             except UndecidedError:
                 return None
             shown |= dict(zip(sorted(selected), joint.agreements, strict=True))
@@ -293,7 +281,7 @@ class JointEstimator:
         detection = self._in_view(number, pose, original, agreement)
         if observation is None:
             detection = replace(detection, peaks=np.full_like(original.peaks, np.nan))
-        detection = self._refiner.verified(detection, view.image, view.K, USUAL_MOVE)
+        detection = self.refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
         if observation is not None and not original.kept:
@@ -331,7 +319,7 @@ class JointEstimator:
         )
         odds += COINCIDENCE * (max(len(observations), agreeing) - 1)
         # The score of the best single view, with the log odds of all views instead of this view's.
-        score = to_probability(log_odds(best.score) + self._slope * (odds - single_odds))
+        score = to_probability(log_odds(best.score) + self.slope * (odds - single_odds))
         covariance = np.linalg.inv(pose.information)
         given = best.object, score, to_probability(odds), pose.T_cam_obj, covariance
         return JointPart(observations, WorldDetection(*given, evidence, disagreement))

@@ -8,7 +8,7 @@ still determines the pose, because one pose in the world explains the keypoints 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,23 +35,16 @@ if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator, SeenMaps
 
 
+@dataclass(eq=False)
 class JointSearch:
-    """Searches poses at the centroid of a detection in one view.
+    """Searches poses at the centroid of a detection in one view."""
 
-    Args:
-        estimator: Estimator of the parts.
-        views: Images with the poses of their cameras.
-        maps: Maps of each view in all sizes.
-    """
+    estimator: PoseEstimator  # estimator of the parts
+    views: Sequence[PosedImage]  # images with the poses of their cameras
+    maps: Sequence[Sequence[SeenMaps]]  # maps of each view in all sizes
 
-    def __init__(
-        self,
-        estimator: PoseEstimator,
-        views: Sequence[PosedImage],
-        maps: Sequence[Sequence[SeenMaps]],
-    ) -> None:
-        self._estimator, self._views, self._maps = estimator, views, maps
-        self._numbers = {part.name: number for number, part in enumerate(estimator.parts)}
+    def __post_init__(self) -> None:
+        self._numbers = {part.name: number for number, part in enumerate(self.estimator.parts)}
         self._searches: dict[str, PoseSearch] = {}
 
     def __call__(self, observation: PartObservation) -> PartObservation | None:
@@ -62,8 +55,8 @@ class JointSearch:
         Returns:
             The observation; None if the centroid or the range of depths is unknown.
         """
-        detection, view = observation.detection, self._views[observation.view]
-        number, seen = self._numbers[detection.object], self._maps[observation.view]
+        detection, view = observation.detection, self.views[observation.view]
+        number, seen = self._numbers[detection.object], self.maps[observation.view]
         ranges = [item.depths[number] for item in seen if item.depths is not None]
         known = [depths for depths in ranges if depths is not None]
         centroid = detection.peaks[CENTROID]
@@ -74,8 +67,8 @@ class JointSearch:
         T_world_obj = self._search(detection.object).pose(
             transform(invert_transform(view.T_cam_world), tried)
         )
-        cuboid, focal_px = self._estimator.cuboids[number], focal_length(seen[0].K)
-        T_cam_obj, stride = view.pose(T_world_obj), self._estimator.network.stride
+        cuboid, focal_px = self.estimator.cuboids[number], focal_length(seen[0].K)
+        T_cam_obj, stride = view.pose(T_world_obj), self.estimator.network.stride
         covariance = search_covariance(T_cam_obj, cuboid, focal_px, stride)
         searched = replace(
             detection,
@@ -88,10 +81,10 @@ class JointSearch:
 
     def _refined(self, detection: Detection, view: PosedImage) -> Detection:
         """Return a refined detection, whose score contains the log odds of the refined pose."""
-        refiner = self._estimator.refiner
+        refiner = self.estimator.refiner
         assert refiner is not None  # several views require refinement
         refined = refiner(detection, view.image, view.K, view.depth)
-        options, before = self._estimator.recovery, log_odds(detection.probability or 0.0)
+        options, before = self.estimator.recovery, log_odds(detection.probability or 0.0)
         gain = options.refined_verification * (log_odds(refined.probability or 0.0) - before)
         by_depth = view.depth is not None and refiner.uses_depth
         (calibrated,) = recalibrate([refined], options, by_depth)
@@ -101,13 +94,13 @@ class JointSearch:
         """Return the search of a part in the maps of all views, prepared once."""
         if name not in self._searches:
             number = self._numbers[name]
-            cuboid, stride = self._estimator.cuboids[number], self._estimator.network.stride
+            cuboid, stride = self.estimator.cuboids[number], self.estimator.network.stride
             channels = slice(number * len(cuboid), (number + 1) * len(cuboid))
             posed = [
                 PosedMaps(
                     item.belief[channels].float().cpu().numpy(), item.K, stride, view.T_cam_world
                 )
-                for view, seen in zip(self._views, self._maps, strict=True)
+                for view, seen in zip(self.views, self.maps, strict=True)
                 for item in seen
             ]
             self._searches[name] = PoseSearch(posed, cuboid)

@@ -22,6 +22,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -158,7 +159,7 @@ class RegionRefiner:
         try:
             (coarse,) = self.rounds(image, K, T_cam_obj, stages=[COARSE])
             reach = search_distance(coarse, prior)
-            end = _coarse_end(coarse, T_cam_obj, prior, reach)
+            end = Descent([coarse], prior, reach).coarse_end(T_cam_obj)
             coarse.learn(end, reach)
             return coarse.agreement(end, reach).share
         except UndecidedError:
@@ -185,7 +186,7 @@ class RegionRefiner:
         rounds = self.rounds(image, K, start.T_cam_obj, further_terms=[depth.term(visible)])
         reach = search_distance(rounds[0], Prior(start.T_cam_obj, start.information))
         # Depth gets more weight as its residuals shrink, so the descent needs all rounds.
-        end = _descend(rounds, start.T_cam_obj, depth.prior, reach)
+        end = Descent(rounds, depth.prior, reach).run(start.T_cam_obj)
         information = depth.information(end.T_cam_obj, visible)
         return end, rounds[-1].check(end, depth.prior, reach, information)
 
@@ -229,6 +230,44 @@ def refinement(end: Solution, agreement: OutlineAgreement) -> Refinement:
     return Refinement(end.T_cam_obj, covariance, "", agreement.share, agreement.support)
 
 
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Descent in rounds of refinement, under a prior and within a search distance."""
+
+    rounds: Sequence[Round]  # rounds of optimisation, from coarse to fine
+    prior: Prior  # distribution of the pose before the refinement
+    reach: float  # search distance, pixels of the image
+
+    def run(self, start: Transform) -> Solution:
+        """Descend in one round after the other from a start pose."""
+        end = Solution(start, self.prior.information)
+        for stage in self.rounds:
+            stage.learn(end.T_cam_obj, self.reach)
+            end = stage.descend(end.T_cam_obj, self.prior, self.reach)
+        return end
+
+    def coarse_end(self, start: Transform) -> Transform:
+        """Return the pose after the first round; the prior's deviations are widened by WIDENED."""
+        weaker = Prior(self.prior.T_cam_obj, self.prior.information / WIDENED**2)
+        return replace(self, rounds=self.rounds[:1], prior=weaker).run(start).T_cam_obj
+
+    def refine(self, start: Transform) -> Outcome:
+        """Descend, repeat the last round until it converges, and check the result.
+
+        Raises:
+            UndecidedError: :meth:`Round.check` rejects the result.
+        """
+        end, last = self.run(start), self.rounds[-1]
+        # Each repetition learns the colours at a better pose, within the smallest search distance.
+        repetition = Descent([last], self.prior, EDGE_PX)
+        for _ in range(MAX_REPEATS if self.reach > EDGE_PX else 0):
+            before = end.T_cam_obj
+            end = repetition.run(before)
+            if has_converged(end, before):
+                break
+        return end, last.check(end, self.prior, self.reach, self.prior.information)
+
+
 def _search(
     rounds: Sequence[Round], prior: Prior, wide_prior: Prior, starts: Starts | None
 ) -> Outcome:
@@ -246,10 +285,14 @@ def _search(
     outcome, failure = None, None
     try:
         search_px = search_distance(rounds[0], prior)
-        needed, start = necessary_rounds(rounds, search_px), prior.T_cam_obj
-        if needed[0] is not needed[-1]:  # the list may contain the last round only
-            start, needed = _coarse_end(needed[0], start, prior, search_px), needed[1:]
-        outcome = _refine(needed, start, prior, search_px)
+        descent, start = (
+            Descent(necessary_rounds(rounds, search_px), prior, search_px),
+            prior.T_cam_obj,
+        )
+        if descent.rounds[0] is not descent.rounds[-1]:  # the last round may be the only one
+            start = descent.coarse_end(start)
+            descent = replace(descent, rounds=descent.rounds[1:])
+        outcome = descent.refine(start)
     except UndecidedError as undecided:
         failure = undecided
     if starts is not None and (outcome is None or outcome[1].share < MIN_AGREEMENT):
@@ -289,41 +332,28 @@ def _search_far(
         former_agreement = last.agreement(given, search_px) if nearby is None else nearby[1]
         least_support = max(MIN_SUPPORT, former_agreement.support + MIN_SUPPORT_GAIN)
         first.learn(given, search_px)
+        descent = Descent(rounds, wide_prior, search_px)
         further_starts = [*starts, *wide_prior.draws(1 / SPREAD, NUM_DRAWS)]
         further_starts.sort(key=lambda start: -first.log_likelihood(start, wide_prior))
         coarse_ends = []
         for start in (given, *further_starts[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                coarse_ends.append(_coarse_end(first, start, wide_prior, search_px))
+                coarse_ends.append(descent.coarse_end(start))
         first.learn(given, search_px)  # compare all ends in the same colours
         coarse_ends.sort(key=lambda end: -first.log_likelihood(end, wide_prior))
         for coarse_end in coarse_ends[:NUM_CONTINUED]:
             with contextlib.suppress(UndecidedError):
-                end = _descend(rounds[1:], coarse_end, wide_prior, search_px).T_cam_obj
+                end = replace(descent, rounds=rounds[1:]).run(coarse_end).T_cam_obj
                 # Weaken the prior until this end is at the expected squared distance, 6.
                 factor = max(1.0, prior.squared_distance(end) / 6)
                 weakened_prior = Prior(given, prior.information / factor)
-                outcome = _refine([last], end, weakened_prior, search_px)
+                outcome = Descent([last], weakened_prior, search_px).refine(end)
                 least = MIN_AGREEMENT if best is None else best[1].share
                 if outcome[1].share >= least and outcome[1].support >= least_support:
                     best = outcome
             if best is not None and best[1].share >= CERTAIN:
                 break
     return best
-
-
-def _coarse_end(coarse: Round, start: Transform, prior: Prior, reach: float) -> Transform:
-    """Return the pose after the coarse round; the prior's deviations are widened by ``WIDENED``.
-
-    Args:
-        coarse: The coarse round.
-        start: Start pose.
-        prior: Distribution of the pose before the refinement.
-        reach: Search distance, pixels of the image.
-    """
-    coarse.learn(start, reach)
-    weaker = Prior(prior.T_cam_obj, prior.information / WIDENED**2)
-    return coarse.descend(start, weaker, reach).T_cam_obj
 
 
 def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
@@ -341,40 +371,9 @@ def necessary_rounds(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
     return rounds
 
 
-def _refine(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Outcome:
-    """Descend in one round after another, repeat the last until it converges, and check the result.
-
-    Args:
-        rounds: Rounds of optimisation, from coarse to fine.
-        start: Start pose.
-        prior: Distribution of the pose before the refinement.
-        reach: Search distance, pixels of the image.
-
-    Raises:
-        UndecidedError: :meth:`Round.check` rejects the result.
-    """
-    end, last = _descend(rounds, start, prior, reach), rounds[-1]
-    for _ in range(MAX_REPEATS if reach > EDGE_PX else 0):
-        before = end.T_cam_obj
-        # Each repetition learns the colours at a better pose, within the smallest search distance.
-        end = _descend([last], before, prior, EDGE_PX)
-        if has_converged(end, before):
-            break
-    return end, last.check(end, prior, reach, prior.information)
-
-
 def has_converged(end: Solution, before: Transform) -> bool:
     """Return whether a round moved the pose by less than ``CONVERGED`` standard deviations."""
     return Prior(before, end.information).squared_distance(end.T_cam_obj) < CONVERGED**2
-
-
-def _descend(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Solution:
-    """Descend in one round after the other; see :func:`_refine` for the arguments."""
-    end = Solution(start, prior.information)
-    for stage in rounds:
-        stage.learn(end.T_cam_obj, reach)
-        end = stage.descend(end.T_cam_obj, prior, reach)
-    return end
 
 
 def search_distance(coarse: Round, prior: Prior) -> float:

@@ -83,35 +83,24 @@ class OutlineAgreement:
     support: float
 
 
+Odds = Float32[np.ndarray, "height width"]  # log odds that each pixel shows the part
 Silhouette = tuple[PosedMesh, UInt8[np.ndarray, "height width"]]  # posed mesh and its mask
 
 
+@dataclass(eq=False)
 class Round:
-    """A round of refinement on a crop, with the learned colours of part and surroundings.
+    """A round of refinement on a crop, with the learned colours of part and surroundings."""
 
-    Args:
-        mesh: Mesh of the part.
-        crop: Image around the part, at the stage's resolution.
-        stage: Settings of the round.
-        weights: Weights of colours and edges.
-        more: Solver terms in addition to the outline.
-        scale_error: Largest relative error of the outline's scale.
-    """
+    mesh: OutlineMesh  # mesh of the part
+    crop: Crop  # image around the part, at the stage's resolution
+    stage: RegionStage  # settings of the round
+    weights: Weights  # weights of colours and edges
+    more: Sequence[Term] = ()  # solver terms in addition to the outline
+    scale_error: float = SCALE_ERROR  # largest relative error of the outline's scale
 
-    def __init__(
-        self,
-        mesh: OutlineMesh,
-        crop: Crop,
-        stage: RegionStage,
-        weights: Weights,
-        more: Sequence[Term] = (),
-        scale_error: float = SCALE_ERROR,
-    ) -> None:
-        self._scale_error = scale_error
-        self.crop, self.stage, self._weights = crop, stage, weights
-        self._mesh, self._more, self._is_followed = mesh, more, weights == FOLLOWED
-        self._spacing = max(1.5, 3.0 * crop.extent / stage.points)
-        self._odds: Float32[np.ndarray, "height width"] = np.zeros(crop.size[::-1], np.float32)
+    def __post_init__(self) -> None:
+        self._spacing = max(1.5, 3.0 * self.crop.extent / self.stage.points)
+        self._odds: Odds = np.zeros(self.crop.size[::-1], np.float32)
         self._smooth_odds = self._odds
         self._last: tuple[Transform, Silhouette | None] = np.empty((0, 0)), None
 
@@ -138,7 +127,7 @@ class Round:
         silhouette = self._silhouette(pose)
         if silhouette is None:
             return None
-        contour = find_contour(self._mesh, *silhouette, self._spacing)
+        contour = find_contour(self.mesh, *silhouette, self._spacing)
         return contour if len(contour) >= MIN_POINTS else None
 
     def descend(self, start: Transform, prior: Prior, reach: float) -> Solution:
@@ -148,7 +137,7 @@ class Round:
             UndecidedError: The outline leaves the image.
         """
         # The outline term is last, because its scale error depends on the sum of all other terms.
-        end = descend(start, prior, [*self._more, self.term(reach)], self.stage.steps)
+        end = descend(start, prior, [*self.more, self.term(reach)], self.stage.steps)
         if end is None:
             raise UndecidedError("the part's outline left the image")
         return end
@@ -163,7 +152,7 @@ class Round:
             rows = outline_rows(contour, pose, self.crop.K)
             shifts = self._shifts(contour, reach)
             spacing, extent, position = self._spacing, self.crop.extent, pose[:3, 3].copy()
-            return region_terms(rows, shifts, prior, spacing, extent, position, self._scale_error)
+            return region_terms(rows, shifts, prior, spacing, extent, position, self.scale_error)
 
         return outline
 
@@ -173,7 +162,7 @@ class Round:
         if silhouette is None:
             return -math.inf
         inside = float(self._odds.ravel() @ silhouette[1].ravel())
-        inside *= self._weights.colour / INDEPENDENT_PX
+        inside *= self.weights.colour / INDEPENDENT_PX
         return inside - 0.5 * prior.squared_distance(pose)
 
     def agreement(self, pose: Transform, reach: float) -> OutlineAgreement:
@@ -210,10 +199,12 @@ class Round:
             limit = f"more than {FARTHEST:g}"
             raise UndecidedError(f"{distance:.1f} standard deviations from the given pose, {limit}")
         rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
-        is_near = self._is_followed and np.mean((rows @ prior.offset(end.T_cam_obj)) ** 2) < 1.0
+        is_near = (
+            self.weights == FOLLOWED and np.mean((rows @ prior.offset(end.T_cam_obj)) ** 2) < 1.0
+        )
         # Compare with the prior's pose, except for a tracked part that moved less than a pixel,
         # where noise would decide, and with further terms, which may contradict the image.
-        if not is_near and not self._more:
+        if not is_near and not self.more:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
                 raise UndecidedError("the image agrees as well with the given pose")
@@ -254,7 +245,7 @@ class Round:
             information: Information at the end without the outline.
         """
         added, before = end.information - information, prior.information
-        if self._is_followed:
+        if self.weights == FOLLOWED:
             rotation, shift = PRECISE
             firm = np.repeat([rotation, shift * float(end.T_cam_obj[2, 3])], 3) ** 2
             before = np.linalg.inv(np.linalg.inv(before) + np.diag(firm))
@@ -263,14 +254,14 @@ class Round:
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
         """Measure where the part ends along the normals of a contour, within a search distance."""
         reach, odds, colours = self.reach(reach), self._smooth_odds, self.crop.colours
-        return find_shifts(odds, colours, contour, reach, _step(reach), self._weights)
+        return find_shifts(odds, colours, contour, reach, _step(reach), self.weights)
 
     def _silhouette(self, pose: Transform) -> Silhouette | None:
         """Return the mesh at a pose and its mask, cached for the last pose."""
         if self._last[0] is not pose:
-            posed_mesh, silhouette = posed(self._mesh, pose, self.crop.K), None
+            posed_mesh, silhouette = posed(self.mesh, pose, self.crop.K), None
             if posed_mesh is not None:
-                silhouette = posed_mesh, filled_mask(self._mesh, posed_mesh, self.crop.size)
+                silhouette = posed_mesh, filled_mask(self.mesh, posed_mesh, self.crop.size)
             self._last = pose, silhouette
         return self._last[1]
 
