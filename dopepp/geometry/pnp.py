@@ -57,22 +57,14 @@ _ONE_PIXEL: Final = np.eye(2)
 
 @dataclass(frozen=True)
 class PnPResult:
-    """An estimated pose, or the reason for its absence.
+    """An estimated pose, or the reason for its absence."""
 
-    Attributes:
-        T_cam_obj: Object-to-camera transform, metres; None without a plausible pose.
-        reprojection_error_px: RMS distance over the inliers, pixels; infinite without a pose.
-        inliers: Whether each point is within :data:`~dopepp.geometry.refine.GATE` standard
-            deviations of its projection.
-        reason: Reason for the missing pose; empty with a pose.
-        covariance: Covariance of a rotation vector about the object's origin and a shift (camera
-            axes, radians, metres), from the inliers' covariances; None without a pose.
-    """
-
-    T_cam_obj: Transform | None
-    reprojection_error_px: float
-    inliers: Bool[np.ndarray, "n"]
-    reason: str = ""
+    T_cam_obj: Transform | None  # object to camera, metres; None without a plausible pose
+    reprojection_error_px: float  # RMS distance over the inliers; infinite without a pose
+    inliers: Bool[np.ndarray, "n"]  # whether each point is within GATE deviations of its projection
+    reason: str = ""  # reason for the missing pose; empty with a pose
+    # Covariance of a rotation vector about the object's origin and a shift (camera axes, radians,
+    # metres), from the inliers' covariances; None without a pose
     covariance: Float[np.ndarray, "6 6"] | None = None
 
 

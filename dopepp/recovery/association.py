@@ -56,28 +56,18 @@ RIVALS: Final = -2  # marks a corner for which two instances prefer the same pea
 
 
 class ObjectPeaks(NamedTuple):
-    """The peaks of one object's corners and centroids on one image.
+    """The peaks of one object's corners and centroids on one image, input pixels."""
 
-    Attributes:
-        position: (x, y) of peaks of corners 0–7, input pixels; NaN in slots without a peak.
-        score: Belief at the peak; 0 in slots without a peak.
-        covariance_px: Covariance of the position, pixels².
-        toward: Mean vector of the field at the peak, pointing to the centroid. The shorter it is,
-            the less certain is its direction.
-        centroid: (x, y) of the centroid peaks, one per instance, input pixels.
-        centroid_score: Belief at each centroid peak.
-        centroid_covariance_px: Covariance of each centroid's position, pixels².
-        area_px: Area of the network's input, pixels².
-    """
-
-    position: CornerPeaks
-    score: Float[np.ndarray, "8 peaks"]
-    covariance_px: Float[np.ndarray, "8 peaks 2 2"]
+    position: CornerPeaks  # (x, y) of peaks of corners 0–7; NaN in slots without a peak
+    score: Float[np.ndarray, "8 peaks"]  # belief at the peak; 0 in slots without a peak
+    covariance_px: Float[np.ndarray, "8 peaks 2 2"]  # covariance of the position
+    # Mean vector of the field at the peak, pointing to the centroid. The shorter it is, the less
+    # certain is its direction.
     toward: CornerPeaks
-    centroid: Float[np.ndarray, "instances 2"]
-    centroid_score: Float[np.ndarray, "instances"]
+    centroid: Float[np.ndarray, "instances 2"]  # (x, y) of the centroid peaks, one per instance
+    centroid_score: Float[np.ndarray, "instances"]  # belief at each centroid peak
     centroid_covariance_px: Float[np.ndarray, "instances 2 2"]
-    area_px: float
+    area_px: float  # area of the network's input
 
 
 class KeypointGroup(NamedTuple):

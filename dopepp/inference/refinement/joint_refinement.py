@@ -166,7 +166,7 @@ def refine_views(
         except UndecidedError:
             continue
         if surface is not None and view.depth is not None:
-            searches[-1].add_depth(surface, region.diameter)
+            searches[-1].add_depth(surface)
     end = Solution(start.T_cam_obj, prior.information)
     num_stages = max((len(search.rounds) for search in searches), default=0)
     terms: list[Term] = []
@@ -194,42 +194,34 @@ def refine_views(
     return JointRefinement(end.T_cam_obj, covariance, agreements, disagreements, informations)
 
 
+@dataclass(eq=False)
 class _ViewSearch:
     """Rounds of refinement on one view, with the term of its depth image.
-
-    Args:
-        number: Index of the view.
-        view: Image with the pose of its camera.
-        region: Refiner of the part.
-        T_world_obj: Start pose in the world, metres.
-        covariance: Covariance of the start pose, world axes.
-        weights: Weights of colours and edges.
 
     Raises:
         UndecidedError: Too little of the outline is on the image.
     """
 
-    def __init__(
-        self,
-        number: int,
-        view: PosedImage,
-        region: RegionRefiner,
-        T_world_obj: Transform,
-        covariance: PoseMatrix,
-        weights: Weights,
-    ) -> None:
-        self.number, self._view = number, view
-        self._start = view.to_camera(T_world_obj, covariance)
-        rounds = region.rounds(view.image, view.K, self._start.T_cam_obj, weights)
+    number: int  # index of the view
+    view: PosedImage
+    region: RegionRefiner  # refiner of the part
+    T_world_obj: Transform  # start pose in the world
+    covariance: PoseMatrix  # covariance of the start pose, world axes
+    weights: Weights  # weights of colours and edges
+
+    def __post_init__(self) -> None:
+        view = self.view
+        self._start = view.to_camera(self.T_world_obj, self.covariance)
+        rounds = self.region.rounds(view.image, view.K, self._start.T_cam_obj, self.weights)
         self._reach = search_distance(rounds[0], self._start)
         self.rounds: Sequence[Round] = necessary_rounds(rounds, self._reach)
         self._depth: list[Term] = []
 
-    def add_depth(self, surface: SurfacePoints, diameter: float) -> None:
+    def add_depth(self, surface: SurfacePoints) -> None:
         """Add the term of the view's depth image, if the part is on it."""
-        assert self._view.depth is not None
+        assert self.view.depth is not None
         try:
-            given = surface, diameter, self._view.depth, self._view.K, self._start
+            given = surface, self.region.diameter, self.view.depth, self.view.K, self._start
             evidence = DepthEvidence(*given)
         except UndecidedError:
             return
@@ -241,7 +233,7 @@ class _ViewSearch:
 
     def learn(self, T_world_obj: Transform, left: int) -> bool:
         """Learn part and background colours at a pose; return False if too little is visible."""
-        stage, pose = self.round(left), self._view.pose(T_world_obj)
+        stage, pose = self.round(left), self.view.pose(T_world_obj)
         try:
             stage.learn(pose, self._reach)
         except UndecidedError:
@@ -251,12 +243,12 @@ class _ViewSearch:
     def terms(self, left: int) -> list[Term]:
         """Return the depth and outline terms of a refinement round, for the pose in the world."""
         terms = [*self._depth, self.round(left).term(self._reach)]
-        return [ViewTerm(term, self._view) for term in terms]
+        return [ViewTerm(term, self.view) for term in terms]
 
     def agreement(self, T_world_obj: Transform) -> OutlineAgreement | None:
         """Return the outline's agreement with the image, or None if too little of it is visible."""
         try:
-            return self.rounds[-1].agreement(self._view.pose(T_world_obj), self._reach)
+            return self.rounds[-1].agreement(self.view.pose(T_world_obj), self._reach)
         except UndecidedError:
             return None
 

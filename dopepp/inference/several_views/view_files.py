@@ -46,17 +46,11 @@ class CameraPose:
 
 @dataclass(frozen=True, eq=False)
 class CameraPoses:
-    """Camera poses and calibrations of several images, from a file.
+    """Camera poses and calibrations of several images, from a file."""
 
-    Attributes:
-        poses: Camera of each image, by the image's name without folder (BOP: by its number).
-        error: Standard deviations of the poses, metres and radians; None if the file states none.
-        source: Path of the file.
-    """
-
-    poses: Mapping[str, CameraPose]
-    error: tuple[float, float] | None
-    source: str
+    poses: Mapping[str, CameraPose]  # by the image's name without folder (BOP: by its number)
+    error: tuple[float, float] | None  # deviations, metres and radians; None if the file has none
+    source: str  # path of the file
 
     def of(self, image: Path) -> CameraPose:
         """Return the camera of an image, looked up by the image's name, number or folder.

@@ -83,38 +83,29 @@ STAGES: Final = (
 )
 
 
+@dataclass(eq=False)
 class DepthEvidence:
     """Depth image around a part, to which the part's pose is fitted.
-
-    Args:
-        surface: Surface points of the part.
-        diameter: Diameter of the part, metres.
-        depth: Metres along z, aligned to the image, 0 where unknown.
-        K: Camera matrix, pixels.
-        prior: Pose to refine and its covariance.
 
     Raises:
         UndecidedError: The part is not on the depth image.
     """
 
-    def __init__(
-        self,
-        surface: SurfacePoints,
-        diameter: float,
-        depth: Depth,
-        K: CameraMatrix,
-        prior: Prior,
-    ) -> None:
-        points = transform(prior.T_cam_obj, surface.points)
+    surface: SurfacePoints  # surface points of the part
+    diameter: float  # diameter of the part, metres
+    depth: Depth  # metres along z, aligned to the image, 0 where unknown
+    K: CameraMatrix
+    prior: Prior  # pose to refine and its covariance
+
+    def __post_init__(self) -> None:
+        points = transform(self.prior.T_cam_obj, self.surface.points)
         if points[:, 2].min() <= 0:
             raise UndecidedError("the part reaches behind the camera")
-        view = view_around(depth, K, points)
+        view = view_around(self.depth, self.K, points)
         if view is None:
             raise UndecidedError("the part lies outside the depth image")
-        self.prior = prior
-        self._surface, self._diameter, self._view = surface, diameter, view
-        self._given_visible = visible(surface, prior.T_cam_obj)
-        self._before = self._fit(prior.T_cam_obj, self._given_visible)
+        self._view, self._given_visible = view, self.visible(self.prior.T_cam_obj)
+        self._before = self._fit(self.prior.T_cam_obj, self._given_visible)
 
     def descend(self) -> Solution:
         """Fit the prior's pose to the depth by shifts and Gauss–Newton steps, from coarse to fine.
@@ -139,7 +130,7 @@ class DepthEvidence:
 
     def visible(self, pose: Transform) -> Visible:
         """Return which of the part's points are not hidden by the part itself at a pose."""
-        return visible(self._surface, pose)
+        return visible(self.surface, pose)
 
     def information(self, pose: Transform, is_visible: Visible) -> PoseMatrix:
         """Return the information about the pose from the prior and the depth together."""
@@ -149,9 +140,9 @@ class DepthEvidence:
 
     def term(self, is_visible: Visible, stage: DepthStage = FINE) -> DepthTerm:
         """Return the solver term of the depth at the visible points."""
-        reach = max(stage.reach * self._diameter, GATE * self._view.noise)
-        outline = stage.outline * self._diameter
-        return DepthTerm(self._view, self._surface, is_visible, reach, outline)
+        reach = max(stage.reach * self.diameter, GATE * self._view.noise)
+        outline = stage.outline * self.diameter
+        return DepthTerm(self._view, self.surface, is_visible, reach, outline)
 
     def check(self, pose: Transform) -> None:
         """Check that depth fits a pose well, and better than the prior's pose.
@@ -170,8 +161,8 @@ class DepthEvidence:
 
     def _fit(self, pose: Transform, is_visible: Visible) -> Fit:
         """Measure how well the visible points at a pose agree with the depth."""
-        view, spacing = self._view, self._surface.spacing
-        overlay = overlay_surface(view, self._surface, is_visible, pose)
+        view, spacing = self._view, self.surface.spacing
+        overlay = overlay_surface(view, self.surface, is_visible, pose)
         if overlay is None:
             return Fit(0.0, 0.0, np.inf, 0.0)
         gate = GATE * view.noise
@@ -195,13 +186,13 @@ class DepthEvidence:
         if not stage.search:
             return pose
         view = self._view
-        points = transform(pose, self._surface.points[is_visible])
+        points = transform(pose, self.surface.points[is_visible])
         points = np.ascontiguousarray(points[:: -(-len(points) // SEARCHED_POINTS)])
         information = np.ascontiguousarray(self.prior.information[3:, 3:])
         sigma = np.sqrt(np.linalg.inv(information)[2, 2])
         half = int(np.ceil(REACH * sigma / view.noise))
         moved = pose[:3, 3] - self.prior.T_cam_obj[:3, 3]
-        step, tolerance = stage.search * self._diameter, stage.tolerance * view.noise
+        step, tolerance = stage.search * self.diameter, stage.tolerance * view.noise
         shift = np.zeros(3)
         num_votes = _search(view, points, information, moved, step, half, tolerance, shift)
         if num_votes < MIN_FOUND:

@@ -86,7 +86,7 @@ class _Samples(NamedTuple):
     pixels: Float[np.ndarray, "points 2"]  # points of the outline
     normals: Float[np.ndarray, "points 2"]  # outward unit normals
     step: float  # distance between samples, pixels
-    count: int  # number of samples to either side of a point
+    per_side: int  # number of samples to either side of a point
 
 
 @compiled()
@@ -97,16 +97,16 @@ def _changes(colours: Array, positions: _Samples) -> Array:
     two, in the channel in which this difference is largest.
 
     Returns:
-        The 2·count + 2 changes of each point, divided by the mean change plus ``MIN_CHANGE``.
+        The 2·per_side + 2 changes of each point, divided by the mean change plus ``MIN_CHANGE``.
     """
-    pixels, normals, step, count = positions
-    changes = np.empty((len(pixels), 2 * count + 2))
+    pixels, normals, step, per_side = positions
+    changes = np.empty((len(pixels), 2 * per_side + 2))
     height, width = colours.shape[:2]
-    samples = np.empty((2 * count + 5, 3))
+    samples = np.empty((2 * per_side + 5, 3))
     total = 0.0
     for i in range(len(pixels)):
         for k in range(len(samples)):
-            along = (k - count - 2) * step
+            along = (k - per_side - 2) * step
             u = min(max(0.0, pixels[i, 0] + along * normals[i, 0]), width - 1.001)
             v = min(max(0.0, pixels[i, 1] + along * normals[i, 1]), height - 1.001)
             column, row = int(u), int(v)
@@ -117,7 +117,7 @@ def _changes(colours: Array, positions: _Samples) -> Array:
                     row + 1, column + 1, c
                 ]
                 samples[k, c] = (1.0 - b) * above + b * below
-        for k in range(2 * count + 2):
+        for k in range(2 * per_side + 2):
             most = 0.0
             for c in range(3):
                 before = samples[k, c] + samples[k + 1, c]
@@ -126,7 +126,7 @@ def _changes(colours: Array, positions: _Samples) -> Array:
             total += changes[i, k]
     strength = total / changes.size + MIN_CHANGE
     for i in range(len(pixels)):
-        for k in range(2 * count + 2):
+        for k in range(2 * per_side + 2):
             changes[i, k] /= strength
     return changes
 
@@ -136,8 +136,8 @@ def _shifts(
     odds: Array, positions: _Samples, changes: Array, weights: Weights, shifts: Shifts
 ) -> None:
     """Fill ``shifts``, for the log odds of each pixel and the result of :func:`_changes`."""
-    pixels, normals, step, count = positions
-    sums = np.empty(2 * count + 2)
+    pixels, normals, step, per_side = positions
+    sums = np.empty(2 * per_side + 2)
     # The part may end between any two samples, before the first or after the last.
     unknown = step * step * (len(sums) ** 2 - 1) / 12.0
     floor = MIN_DEVIATION**2 + step * step / 12.0
@@ -146,14 +146,14 @@ def _shifts(
         for k in range(len(sums)):
             sums[k] = before + weights.edge * math.log(1.0 + changes[i, k] ** 2)
             most = max(most, sums[k])
-            along = (k - count) * step
+            along = (k - per_side) * step
             before += weights.colour * _sampled(
                 odds, pixels[i, 0] + along * normals[i, 0], pixels[i, 1] + along * normals[i, 1]
             )
         total = first = second = 0.0
         for k in range(len(sums)):
             sums[k] = math.exp(sums[k] - most)
-            shift = (k - count - 0.5) * step
+            shift = (k - per_side - 0.5) * step
             total += sums[k]
             first += sums[k] * shift
             second += sums[k] * shift * shift
