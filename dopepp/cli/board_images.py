@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-from dopepp.core.errors import Interruption, UserError, interruptible
+from dopepp.core.errors import Interruption, RunError, UserError, interruptible
 from dopepp.drawing.pictures import RGBImage, Size, read_photo
 from dopepp.geometry.camera_file import read_camera
 from dopepp.robot.calibration.board import Board, BoardDetection, BoardPose, board_pose, parse_board
@@ -59,21 +59,26 @@ def detect_in_stream(source: str, board: Board) -> tuple[list[BoardDetection], S
     from dopepp.inference.frames import open_sources
 
     views, first_size, count = Views(0), None, 0
-    with suppress(Interruption), interruptible(""):
-        for opened in open_sources([source]):
-            is_live = opened.count is None
-            stride = 1 if is_live else max(1, round((opened.rate or 0) / CHECKS_PER_S))
-            for frame in opened.frames(stride):
-                size = (frame.image.shape[1], frame.image.shape[0])
-                if first_size is None:
-                    views, first_size = Views(size[0]), size
-                count += 1
-                name = Path(frame.name).name if opened.rate is None else f"frame {frame.number}"
-                detection = _detect(board, frame.image, name) if size == first_size else None
-                if detection is not None and views.add(detection):
-                    typer.echo(f"{name}: view {len(views.kept)}", err=True)
-                if views.is_full:
-                    break
+    try:
+        with suppress(Interruption), interruptible(""):
+            for opened in open_sources([source]):
+                is_live = opened.count is None
+                stride = 1 if is_live else max(1, round((opened.rate or 0) / CHECKS_PER_S))
+                for frame in opened.frames(stride):
+                    size = (frame.image.shape[1], frame.image.shape[0])
+                    if first_size is None:
+                        views, first_size = Views(size[0]), size
+                    count += 1
+                    name = Path(frame.name).name if opened.rate is None else f"frame {frame.number}"
+                    detection = _detect(board, frame.image, name) if size == first_size else None
+                    if detection is not None and views.add(detection):
+                        typer.echo(f"{name}: view {len(views.kept)}", err=True)
+                    if views.is_full:
+                        break
+    except RunError as error:  # the camera has stopped
+        if not views.kept:
+            raise
+        typer.echo(f"{error}; the views so far are used", err=True)
     detections = _checked(views.kept, first_size, source, count)
     typer.echo(f"{len(views.kept)} distinct views in {count} images", err=True)
     return detections

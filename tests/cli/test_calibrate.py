@@ -10,10 +10,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from dopepp.core.errors import RunError
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.transform_file import read_transform, transform_record
+from dopepp.inference.frames.media import Video
 from dopepp.inference.several_views.view_files import read_camera_poses
 from dopepp.robot.calibration.board import draw_view, parse_board
 from dopepp.robot.calibration.lens import write_camera
@@ -65,6 +67,21 @@ def test_a_camera_is_calibrated_from_images_or_distinct_views_of_a_video(
     assert "reprojection error 0." in done.output
     assert np.allclose(read_camera(out).K, CAMERA.K, atol=10 if source else 2.5)
     assert not source or "10 distinct views in 15 images" in done.stderr
+
+
+def test_a_camera_that_stops_is_calibrated_from_its_views(run, cell, tmp_path, monkeypatch):
+    whole = Video.frames
+
+    def frames(video, stride=1):
+        yield from whole(video, stride)
+        raise RunError("camera 0: no image for 5 s")
+
+    monkeypatch.setattr(Video, "frames", frames)
+    out = tmp_path / "camera.yaml"
+    words = ("--board", SPEC, "--out", out, "--force")
+    done = run("calibrate", "camera", cell[0] / "board.avi", *words)
+    assert "no image for 5 s; the views so far are used" in done.stderr
+    assert out.exists()
 
 
 def test_the_hand_eye_transform_is_calibrated_and_written(run, cell, tmp_path):
