@@ -15,6 +15,7 @@ from dopepp.data.sample import Sample, SampleSource
 from dopepp.drawing.overlay import YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import Size, read_picture
 from dopepp.drawing.sheet import Tile
+from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import frame_view
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.frame import Row
@@ -75,16 +76,23 @@ def frames_without_parts(
     Images are scaled and cropped to ``camera``, or to the camera of the test data.
     """
     images = PhotoBackgrounds(folder)
-    if camera is None:
-        view = frame_view(data, parts)
-        lens = Camera(view.size, view.K, (), "the camera of the test data")
-    else:
-        lens = read_camera(camera)
+    lens = _camera_of(data, parts) if camera is None else read_camera(camera)
     size = lens.size
     if size is None:
         height, width = read_picture(images.paths[0]).shape[:2]
         size = (width, height)
     return UndistortedFrames(images, lens, size)
+
+
+def _camera_of(data: DataConfig, parts: Parts) -> Camera:
+    """Return the camera of the test data; of its first image, if the images are labelled."""
+    if data.is_rendered("test"):
+        view = frame_view(data, parts)
+        size, K = view.size, view.K
+    else:
+        first = held_out_source(data, parts, "test").sample(0)
+        size, K = first.size, first.K
+    return Camera(size, K, (), "the camera of the test data")
 
 
 def count_false_alarms(

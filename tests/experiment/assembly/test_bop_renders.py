@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.bop_models import bop_parts
@@ -24,6 +25,7 @@ from dopepp.experiment.assembly.build_sources import (
     held_out_source,
 )
 from dopepp.experiment.assembly.renders import validation_renders
+from dopepp.experiment.results.false_alarms import frames_without_parts
 from dopepp.geometry.camera import project_keypoints
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import make_part
@@ -175,6 +177,14 @@ def test_real_frames_and_renders_are_windows_of_equal_scale(config, root):
         for instance in sample.instances:
             shown = project_keypoints(cuboids[instance.label], instance.T_cam_obj, sample.K)
             np.testing.assert_allclose(instance.keypoints, shown, atol=1e-6)
+
+
+def test_images_without_the_part_have_the_camera_of_the_labelled_images(parsed, root, tmp_path):
+    Image.new("RGB", (192, 128)).save(tmp_path / "desk.png")
+    sets = "data.image_sets={train: null, val: null, test: test}"
+    data = parsed("data=bop", f"data.root={root}", sets).data
+    frame = frames_without_parts(tmp_path, None, data, build_parts(data)).sample(0)
+    assert (frame.size, frame.K[0, 0]) == ((96, 64), 210.0)
 
 
 def test_a_real_fraction_requires_an_image_set_for_training(config):
