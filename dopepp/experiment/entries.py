@@ -126,7 +126,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
     In a multirun, a failing job writes ``failed.json`` and a pruned trial ``pruned.json``; the
     other jobs continue. After a user error, the folder of a new single run is removed if it has no
-    results.
+    results, also beside ``resume=`` with a folder that is no run.
 
     Returns:
         In a multirun, the validation score of the run's best checkpoint, else None.
@@ -142,9 +142,10 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     if program.is_first_process():
         program.print_line(f"begins in {program.relative_path(run_dir)}")
     # Hydra's own file may be truncated. A resumed run stores its overrides after the checks.
-    resumed = any(text.startswith("resume=") for text in hydra.overrides.task)
+    given = [text for text in hydra.overrides.task if text.startswith("resume=")]
+    resumed = Path(given[-1].partition("=")[2]) if given else None
     try:
-        if not resumed:
+        if resumed is None:
             from dopepp.experiment.run.resume import remember_overrides
 
             remember_overrides(run_dir)
@@ -152,7 +153,8 @@ def run_job(config: DictConfig, job: Job) -> float | None:
         job(_plain(config), run_dir)
     # Errors are handled here because Hydra would print a stack trace.
     except (UserError, OmegaConfBaseException) as error:
-        if not resumed and program.is_first_process():
+        is_new = resumed is None or not (resumed.exists() and resumed.samefile(run_dir))
+        if is_new and program.is_first_process():
             _remove_unused(run_dir)
         _exit(error if isinstance(error, UserError) else command_line.convert_error(error))
     except RunError as error:
