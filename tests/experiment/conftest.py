@@ -12,7 +12,6 @@ import pytest
 import torch
 import yaml
 from hydra import compose, initialize_config_dir
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import OmegaConf
@@ -58,8 +57,10 @@ def composed():
         if key not in COMPOSED:
             COMPOSED[key] = compose(config, list(key[1:]))
         made = copy.deepcopy(COMPOSED[key])
-        values = [item for item in parsed if item not in chosen]
-        ConfigLoaderImpl._apply_overrides_to_config(values, made)
+        for item in parsed:
+            if item not in chosen:
+                is_new = item.is_add() or item.is_force_add()
+                OmegaConf.update(made, item.key_or_group, item.value(), force_add=is_new)
         plain: dict[str, Any] = OmegaConf.to_container(made, resolve=True, throw_on_missing=True)
         return plain
 
