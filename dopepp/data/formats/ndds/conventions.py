@@ -187,14 +187,14 @@ def find_convention(observations: Sequence[Observation], where: str) -> NddsFind
         for convention in POSE_CONVENTIONS
     }
     ranked = sorted(errors, key=lambda convention: errors[convention])
-    least, reason, listed = errors[ranked[0]], "no known convention fits", ranked[:6]
+    least, reason, listed = errors[ranked[0]], "no known convention fits", ranked[:2]
     if least <= MAX_ERROR_PX:
         best = next(c for c in POSE_CONVENTIONS if errors[c] <= least + _ROUNDING_PX)
         rivals = [c for c in ranked if c != best and not _same_poses(observations, best, c)]
         rival_px = min((errors[rival] for rival in rivals), default=np.inf)
         if rival_px >= _MIN_RATIO * errors[best] + _ROUNDING_PX:
             return NddsFinding(best, errors[best], rival_px, len(observations))
-        reason, listed = "two conventions fit equally well", [best, *rivals[:5]]
+        reason, listed = "two conventions fit equally well", [best, *rivals[:1]]
     figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in listed)
     raise UserError(
         f"{where}: {reason}; reprojection error: {figures}",
