@@ -20,9 +20,13 @@ FOLDER: Final = "profile"  # folder of the run with the report and the trace
 
 
 class Throughput(Callback):
-    """Logs ``throughput/images_per_s`` and the share of time ``throughput/loader_wait``."""
+    """Logs ``throughput/images_per_s`` and the share of time ``throughput/loader_wait``.
 
-    def __init__(self) -> None:
+    ``cache`` is the option ``data.cache``: without a cache, a slow loader gets advice to use one.
+    """
+
+    def __init__(self, cache: str = "none") -> None:
+        self._is_cached = cache != "none"
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = 0.0
 
@@ -54,7 +58,7 @@ class Throughput(Callback):
             hint = "; data.cache=memory or disk renders each image once"
             text = "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s"
             values = (trainer.current_epoch, speed, 100 * waiting)
-            _log.info(text, *values, hint if waiting > 0.2 else "")
+            _log.info(text, *values, hint if waiting > 0.2 and not self._is_cached else "")
 
 
 class RunProgress(TQDMProgressBar):

@@ -3,6 +3,7 @@
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -97,6 +98,16 @@ def test_metrics_images_and_throughput(validate, make_system, make_datamodule, t
     lines = [r.getMessage() for r in caplog.records if "images/s" in r.getMessage()]
     assert len(lines) == len({line.partition(":")[0] for line in lines}) > 0
     assert "% of the time waiting for the loader" in lines[0]
+
+
+@pytest.mark.parametrize(("cache", "is_advised"), [("none", True), ("memory", False)])
+def test_only_a_slow_loader_without_cache_gets_advice(cache, is_advised, caplog):
+    caplog.set_level(logging.INFO)
+    trainer, callback = MagicMock(is_global_zero=True, current_epoch=0), Throughput(cache)
+    callback.on_train_epoch_start(trainer, MagicMock())
+    callback.on_train_batch_start(trainer, MagicMock())  # all time is spent waiting
+    callback.on_train_epoch_end(trainer, MagicMock())
+    assert ("data.cache" in caplog.text) == is_advised
 
 
 def test_a_validation_without_instances_logs_nan(validate, make_system, make_noise):
