@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dopepp.cli.outputs import Outputs
 from dopepp.data.formats.bop.bop_results import read_results
-from dopepp.inference.frames.media import Video
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
 
@@ -98,13 +97,15 @@ def test_an_image_without_the_part_has_an_empty_line(predict, files, tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interruptions_keep_the_written_files(predict, files, tmp_path, monkeypatch, number, code):
-    whole = Video.frames
+    write, written = Outputs.write, []
 
-    def interrupted(self, stride):
-        yield from islice(whole(self, stride), 3)
-        os.kill(os.getpid(), number)
+    def interrupted(self, result):
+        write(self, result)
+        written.append(result)
+        if len(written) == 3:
+            os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(Video, "frames", interrupted)
+    monkeypatch.setattr(Outputs, "write", interrupted)
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
     done = predict(files / "clip.avi", "--save", out, "--json", poses, "--csv", csv, code=code)
     assert done.stderr.splitlines()[-1] == "interrupted; the written files are complete"
