@@ -285,10 +285,8 @@ def _search(
     outcome, failure = None, None
     try:
         search_px = search_distance(rounds[0], prior)
-        descent, start = (
-            Descent(necessary_rounds(rounds, search_px), prior, search_px),
-            prior.T_cam_obj,
-        )
+        descent = Descent(necessary_rounds(rounds, search_px), prior, search_px)
+        start = prior.T_cam_obj
         if descent.rounds[0] is not descent.rounds[-1]:  # the last round may be the only one
             start = descent.coarse_end(start)
             descent = replace(descent, rounds=descent.rounds[1:])
