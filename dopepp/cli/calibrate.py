@@ -225,6 +225,7 @@ def rig(
 
     from dopepp.cli.board_images import detect_in_folder
     from dopepp.core.files import check_target
+    from dopepp.core.yaml import read_yaml
     from dopepp.geometry.camera_file import read_camera
     from dopepp.geometry.transform_file import read_transform, transform_record
     from dopepp.robot.calibration.board import parse_board
@@ -235,7 +236,8 @@ def rig(
     target = parse_board(board)
     T_base_first, doubts = np.eye(4), list[str]()
     if hand_eye is not None:
-        T_base_first, doubts = read_transform(hand_eye, "T_base_cam"), _doubts(hand_eye)
+        T_base_first = read_transform(hand_eye, "T_base_cam")
+        doubts = _doubts(read_yaml(hand_eye), hand_eye)
     boards, cameras = {}, {}
     for images in sorted(path for path in folder.glob("*") if path.is_dir()):
         detections, size = detect_in_folder(images, target)
@@ -306,14 +308,11 @@ def _bench_from_board(
         T_base_cam = {name: flanges[row] @ T_mount_cam for name, row in rows.items()}
     used = [name for name in boards if name in T_base_cam]
     bench = bench_of_board([T_base_cam[name] @ boards[name] for name in used], parse_board(spec))
-    return replace(bench, findings=(*bench.findings, *_doubts(hand_eye))), used
+    return replace(bench, findings=(*bench.findings, *_doubts(content, hand_eye))), used
 
 
-def _doubts(hand_eye: Path) -> list[str]:
-    """Return the finding that a hand-eye file is not trusted, if it is not."""
-    from dopepp.core.yaml import read_yaml
-
-    content = read_yaml(hand_eye)
+def _doubts(content: object, hand_eye: Path) -> list[str]:
+    """Return the finding that a hand-eye file with this content is not trusted, if it is not."""
     is_trusted = isinstance(content, dict) and content.get("trusted") is True
     return [] if is_trusted else [f"{hand_eye} is not trusted"]
 

@@ -25,6 +25,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
+from functools import cache
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -58,8 +59,12 @@ def available_cores() -> int:
     return len(_cores())
 
 
+@cache
 def physical_cores() -> int:
-    """Return the number of physical CPU cores for this process; outside Linux, of logical cores."""
+    """Return the number of physical CPU cores for this process; outside Linux, of logical cores.
+
+    The number is read once, because it is asked for in every image.
+    """
     siblings = set()
     for core in _cores():
         path = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list")
@@ -85,9 +90,9 @@ def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) ->
     The threads run at the same time only while the function has released the GIL, as compiled loops
     and OpenCV do.
     """
-    if len(items) < 2:
+    if len(items) < 2 or (count := num_threads()) < 2:
         return [function(item) for item in items]
-    with ThreadPoolExecutor(min(len(items), num_threads())) as threads:
+    with ThreadPoolExecutor(min(len(items), count)) as threads:
         return list(threads.map(function, items))
 
 
