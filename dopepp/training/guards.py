@@ -27,6 +27,7 @@ from dopepp.drawing.overlay import GREEN, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.models.losses import MapMSE
 from dopepp.models.storage import write_atomic
 from dopepp.training.system import PoseSystem, ValidationOutput, all_finite
 
@@ -254,6 +255,11 @@ class EmptyMaps(Callback):
             f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
             "train longer (trainer.max_epochs)"
         )
+        if isinstance(system.loss, MapMSE):
+            steps += (
+                "; with model/loss=mse, empty maps have a small squared error because peaks cover "
+                "few cells; model/loss=spatial_ce has no such plateau"
+            )
         causes = [
             (not bad_rate and not bad_labels, f"too few training steps{{}}: {steps}"),
             (bad_rate, f"a learning rate that is too high or too low{{}}: {about_rate}"),
