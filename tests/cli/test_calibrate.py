@@ -10,6 +10,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from dopepp.cli.board_images import image_names
 from dopepp.core.errors import RunError
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
@@ -161,11 +162,16 @@ def test_wrong_options_are_one_line(refused, tmp_path, monkeypatch, words, messa
     assert message in refused("calibrate", *words)
 
 
+def test_images_are_in_the_order_of_their_numbers(tmp_path):
+    for name in ("10.png", "9.png"):
+        (tmp_path / name).touch()
+    assert image_names(tmp_path) == ["9.png", "10.png"]
+
+
 def test_images_without_the_board_are_an_error(run, cell, tmp_path):
-    shutil.copy(cell[0] / "0.png", tmp_path)
     words = ("--board", "chess:9x6:20", "--out", tmp_path / "c.yaml")
-    done = run("calibrate", "camera", tmp_path, *words, code=2)
-    assert "no board in any of 1 images" in done.output
+    done = run("calibrate", "camera", cell[0], *words, code=2)
+    assert "no board in any of 10 images" in done.output
 
 
 @pytest.fixture(scope="module")

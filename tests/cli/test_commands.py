@@ -35,11 +35,12 @@ def image_file(tmp_path):
 def test_predict_verifies_and_refines(run, checkpoint, image_file, tmp_path):
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
-    options = ("--verify", "--refine", "region,depth", "--depth", depth)
-    done = run("predict", checkpoint, image_file, *K, *options)
-    for line in done.stdout.splitlines():
-        assert 0 <= json.loads(line)["agreement"] <= 1
-        assert json.loads(line)["kept"]  # a pose on noise is reported
+    measured = ("--depth", depth)
+    for options in (("depth", *measured), ("region",), ("region,depth", *measured)):
+        done = run("predict", checkpoint, image_file, *K, "--verify", "--refine", *options)
+        for line in done.stdout.splitlines():
+            assert 0 <= json.loads(line)["agreement"] <= 1
+            assert json.loads(line)["kept"]  # a pose on noise is reported
 
 
 @pytest.mark.parametrize(

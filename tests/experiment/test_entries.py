@@ -38,15 +38,18 @@ def test_the_console_answers_before_pytorch_is_imported(command):
         assert (ended, bool(re.search(pattern, output))) == (code, True), (words, output)
 
 
-def test_a_rejected_run_leaves_no_folder_and_keeps_existing_files(call, tiny_options, tmp_path):
-    output, wrong = f"output_dir={tmp_path}", "data.parts=[none.stl]"
-    call("train.py", *tiny_options, wrong, output, code=2)
+def test_a_rejected_run_leaves_no_folder(call, tiny_options, tmp_path):
+    output = f"output_dir={tmp_path}"
+    call("train.py", *tiny_options, "data.parts=[none.stl]", output, code=2)
     call("train.py", *tiny_options, "trainer.max_epochs=many", output, code=2)
     call("evaluate.py", "ckpt_path=none.ckpt", output, code=2)
     call("evaluate.py", "ckpt_path=pretrained/servoholder", "data.num_test=0", output, code=2)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_rejected_run_keeps_existing_files(call, tiny_options, tmp_path):
     (tmp_path / "mine.txt").touch()
-    call("train.py", *tiny_options, wrong, f"hydra.run.dir={tmp_path}", code=2)
+    call("train.py", *tiny_options, "data.parts=[none.stl]", f"hydra.run.dir={tmp_path}", code=2)
     assert (tmp_path / "mine.txt").is_file()
 
 

@@ -7,10 +7,12 @@ import pandas as pd
 import pytest
 import torch
 
+from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.build_system import build_untrained
+from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.cost import (
     WARM_UP,
     SimulatedMapsEstimator,
@@ -46,20 +48,24 @@ def test_counts_match_the_paper_and_times_are_written(parsed, tmp_path, capsys):
     assert read_rgb(tmp_path / "frame_rate.png").std() > 0
 
 
-def test_likely_maps_yield_the_poses_of_the_image(parsed):
-    """Recovery then needs as much time as with a trained network."""
-    config = parsed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
+def estimator_of(config: RunConfig) -> tuple[SimulatedMapsEstimator, MapGeometry, DescribedSource]:
     parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
     geometry = MapGeometry(network.stride, config.maps.sigma, config.maps.field_radius)
     source = held_out_source(config.data, parts, "test")
-    estimator = SimulatedMapsEstimator(network, description)
+    return SimulatedMapsEstimator(network, description), geometry, source
+
+
+def test_likely_maps_yield_the_poses_of_the_image(parsed):
+    """Recovery then needs as much time as with a trained network."""
+    config = parsed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
+    estimator, geometry, source = estimator_of(config)
     samples, passes = [source.sample(index) for index in range(8)], []
     estimator.network.register_forward_hook(lambda *_: passes.append(1))
     times = time_frames(estimator, samples, geometry, num_frames=2, seed=0)
     assert len(passes) == WARM_UP + 2
     assert (times.seconds > times.network_seconds).all()
-    (part,) = parts
+    (part,) = estimator.parts
 
     def is_right(sample):
         estimator.answer = likely_maps(sample, estimator, geometry, torch.Generator())
@@ -69,3 +75,19 @@ def test_likely_maps_yield_the_poses_of_the_image(parsed):
         return any(np.linalg.norm(e, axis=1).mean() < 0.1 * part.diameter for e in errors)
 
     assert sum(map(is_right, samples)) >= 7
+
+
+@pytest.mark.parametrize("size", ["[128,128]", "[96,64]"])
+def test_likely_maps_have_the_shape_of_the_networks_maps(parsed, size):
+    """Images are padded to the multiple that the network needs, not to the whole input size."""
+    config = parsed(
+        "scale=laptop", "model.width=0.0625", "virtual.preset=paper", f"data.input_size={size}",
+        "data.parts=[servoholder,pivconnector]",
+    )  # fmt: skip
+    estimator, geometry, source = estimator_of(config)
+    sample, own = source.sample(0), []
+    estimator.answer = likely_maps(sample, estimator, geometry, torch.Generator())
+    estimator.network.register_forward_hook(lambda *args: own.append(args[-1][-1]))
+    estimator.predict(sample.image, sample.K)
+    ((belief, field),) = own
+    assert [item.shape for item in estimator.answer] == [belief[0].shape, field[0].shape]

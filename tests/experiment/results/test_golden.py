@@ -274,9 +274,10 @@ def test_conditions(condition, compare_golden):
     compare_golden(condition.name, f"{condition.name}.md", f"{condition.name}.csv")
 
 
-def test_bins(compare_golden):
+@pytest.mark.parametrize("num_methods", [1, 2])
+def test_bins(num_methods, compare_golden):
     part = load_part("pivconnector")
-    metrics = {name: PoseMetrics([part], name) for name in ("dope", "dopepp")}
+    metrics = {name: PoseMetrics([part], name) for name in ("dope", "dopepp")[-num_methods:]}
     for number in range(20):
         T = np.eye(4)
         T[:3, 3] = [0, 0, 0.2 + 0.05 * number]
@@ -288,7 +289,7 @@ def test_bins(compare_golden):
             result = [] if number % 7 == 3 and name == "dope" else [pose]
             first.update(result, [truth], np.diag([600.0, 600, 1]), 640)
     record_breakdown(Path(), metrics, "distance", 3, (ADD_5CM, ADD_01D))
-    compare_golden("bins", "by_distance.csv")
+    compare_golden(f"bins_{num_methods}", "by_distance.csv")
 
 
 # Single runs
@@ -318,12 +319,14 @@ def test_a_report_in_the_terminal(report, all_measures, compare_golden):
     compare_golden(f"report_{'all' if all_measures else 'usual'}")
 
 
-def test_readme_of_a_run(report, compare_golden):
+@pytest.mark.parametrize("keep", [True, False])
+def test_readme_of_a_run(keep, report, compare_golden):
+    config: Any = SimpleNamespace(**vars(CONFIG) | {"keep_checkpoints": keep})
     folder = Path("a run")
     command = {"command": ["train.py", "data.parts=[a,b]"]}
     again = {"command": ["train.py", "resume=RUN"], "earlier": [command, {"other": 1}]}
     write_json(folder / VERSIONS_FILE, again)
-    page = pages.RunReadme(CONFIG, folder)
+    page = pages.RunReadme(config, folder)
     page.begin()
     texts = []
     for state in (pages.INTERRUPTED, pages.FINISHED):
@@ -336,7 +339,7 @@ def test_readme_of_a_run(report, compare_golden):
     page.end(pages.FINISHED, report=report)
     texts.append((folder / "README.md").read_text())
     Path("pages").write_text("-----\n".join(texts))
-    compare_golden("readme_run", "pages", terminal=False)
+    compare_golden(f"readme_{'kept' if keep else 'trial'}", "pages", terminal=False)
 
 
 @pytest.fixture

@@ -1,10 +1,21 @@
 """Random light and materials: colours against physics, shares and ranges over many draws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from dopepp.core.errors import UserError
 from dopepp.virtual import make_surface
+from dopepp.virtual.body import Distractors
 from dopepp.virtual.presets.looks import Lighting, Materials, black_body_rgb
+from dopepp.virtual.presets.placement import (
+    DistancePlacement,
+    FacingTurning,
+    FillPlacement,
+    OffsetPlacement,
+)
+from dopepp.virtual.presets.table import Table
 
 
 def planck_rgb(temperature):
@@ -101,3 +112,23 @@ def test_only_coloured_surfaces_have_texture_noise(sheet, box_surface):
     drawn = [materials.draw(rng, coloured).noise for _ in range(200)]
     assert 1.0 <= min(drawn) < 1.1 < 2.9 < max(drawn) <= 3.0
     assert all(materials.draw(rng, box_surface).noise <= 0.12 for _ in range(200))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Materials(metal_share=1.5),
+        lambda: Materials(layer_pitch=(float("nan"), 1e-4)),
+        lambda: Materials(albedo=(0.1,)),
+        lambda: Lighting(temperature_k=(500, 6500)),
+        lambda: Distractors((3, 1)),
+        lambda: replace(Table(), tilt_deg=(10**400, 1)),
+        lambda: FillPlacement(0.9, 0.6),
+        lambda: DistancePlacement(1.0, 0.5),
+        lambda: OffsetPlacement(distance=0.1, axial=0.1),
+        lambda: FacingTurning(tilt_deg=-1),
+    ],
+)
+def test_wrong_ranges_are_refused(make):
+    with pytest.raises(UserError, match=r"allowed: .*fix: (set|lower|raise)"):
+        make()
