@@ -115,8 +115,10 @@ def test_changed_photos_change_the_described_images(tiny, photos):
 
 
 def test_too_few_photos_are_rejected(tiny, photos):
-    for number in range(5, 12):
+    for number in range(6, 12):
         (photos / f"{number}.png").unlink()
+    assert len(frames(tiny("virtual.backgrounds=./photos"), "val")) == 6
+    (photos / "0.png").unlink()
     with pytest.raises(UserError, match=r"with 5 photos, .*at least 6 different"):
         frames(tiny("virtual.backgrounds=./photos"), "val")
 

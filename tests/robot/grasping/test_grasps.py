@@ -9,7 +9,6 @@ import trimesh
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.part import make_part
-from dopepp.robot.grasping import grasps
 from dopepp.robot.grasping.grasps import (
     MAX_OPENING,
     Grasp,
@@ -106,9 +105,7 @@ def test_both_contacts_lie_on_the_surface_of_a_ring():
         assert ((radius > inner - 1e-4) & (radius < outer + 1e-4)).all()
 
 
-def test_equal_seeds_propose_equal_grasps(monkeypatch):
-    monkeypatch.setattr(grasps, "PAIRS", 300)
-    monkeypatch.setattr(grasps, "MAX_PAIRS", 30)
+def test_equal_seeds_propose_equal_grasps():
     part = part_of(trimesh.creation.box((0.06, 0.03, 0.02)))
     first, second = (propose_grasps(part, 6, seed=3) for _ in range(2))
     assert [grasp.point.tolist() for grasp in first] == [grasp.point.tolist() for grasp in second]
