@@ -9,7 +9,9 @@ images and annotation agree. The refinement uses RGB only, and objects that are 
 visible. Errors are relative to the nearest equivalent of the published pose.
 
 "Distance" is the error along the viewing ray. If it is equal in all frames, the annotation has
-another scale than camera and CAD file. Parameters are chosen on ``--half even`` and reported on
+another scale than camera and CAD file. "Shape" requires depth images: the median deviation of the
+measured depth from the mesh, after subtraction of its median. It does not depend on the annotation.
+Parameters are chosen on ``--half even`` and reported on
 ``--half odd``. Published rotations that are not exactly orthogonal are replaced by the nearest
 rotation.
 """
@@ -44,9 +46,12 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.rotation import nearest_rotation
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_input import read_depth_image
+from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.inference.refinement.region import RegionRefiner
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
+from dopepp.inference.refinement.verification import SharpEdges
 from dopepp.metrics.functional import mahalanobis
 from dopepp.metrics.pose import assign
 from dopepp.parts.part import Part
@@ -64,6 +69,7 @@ class Frame(NamedTuple):
     """One frame with the model numbers and poses of its sufficiently visible objects."""
 
     image: RGBImage
+    depth: np.ndarray | None  # metres along z, 0 where unknown
     K: CameraMatrix
     objects: list[tuple[int, Transform]]
 
@@ -89,7 +95,11 @@ def read_frames(scene: Path, half: slice) -> Iterator[Frame]:
                 T = make_transform(R, np.array(annotation["cam_t_m2c"]) / 1000)
                 objects.append((annotation["obj_id"], T))
         pixels = read_rgb(next((scene / "rgb").glob(f"{int(image):06d}.*")))
-        yield Frame(pixels, np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float), objects)
+        measured = scene / "depth" / f"{int(image):06d}.png"
+        scale = 1e-3 * cameras[image].get("depth_scale", 1.0)
+        depth = read_depth_image(measured, scale) if measured.exists() else None
+        K = np.reshape(cameras[image]["cam_K"], (3, 3)).astype(float)
+        yield Frame(pixels, depth, K, objects)
 
 
 def read_scenes(folder: Path, split: str, half: str = "both") -> Iterator[Frame]:
@@ -171,19 +181,40 @@ def nearest_errors(
     return np.array([error.add, error.rotation, error.translation, along, mspd])
 
 
+def shape_residual(part: Part, T: Transform, frame: Frame) -> float:
+    """Return how far the measured depth deviates from the mesh at a pose, up to an offset, in mm.
+
+    NaN without a depth image.
+    """
+    if frame.depth is None or part.mesh is None:
+        return math.nan
+    mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+    at, edges = posed(mesh, T, frame.K), SharpEdges(mesh)
+    assert at is not None  # the part is in front of the camera
+    triangles = edges.drawn(at, frame.image.shape[1::-1])
+    inside = cv2.erode((triangles >= 0).astype(np.uint8), np.ones((3, 3)))
+    rows, columns = np.nonzero(inside * (frame.depth > 0))
+    normals = edges.normals[triangles[rows, columns]] @ T[:3, :3].T
+    corners = transform(T, mesh.vertices[mesh.faces[triangles[rows, columns], 0]])
+    rays = np.column_stack([columns, rows, np.ones(len(rows))]) @ np.linalg.inv(frame.K).T
+    drawn = (normals * corners).sum(axis=1) / (normals * rays).sum(axis=1)
+    errors = 1e3 * (frame.depth[rows, columns] - drawn)
+    return float(np.median(np.abs(errors - np.median(errors))))
+
+
 def medians(name: str, rows: list[np.ndarray]) -> list[str]:
     """Return the table's row of an object: medians at the start → refined."""
     errors = np.array(rows)
-    before, after, rest = errors[:, :5], errors[:, 5:10], errors[:, 10:]
+    before, after, rest = errors[:, :6], errors[:, 6:12], errors[:, 12:]
     is_kept, surprise, took, limit = rest.T
-    add, turn, shift, along, mspd = (
+    add, turn, shift, along, mspd, shape = (
         f"{np.median(a):.1f} → {np.median(b):.1f}" for a, b in zip(before.T, after.T, strict=True)
     )
     right = " → ".join(f"{np.mean(poses[:, 0] < limit):.0%}" for poses in (before, after))
     worse = f"{np.mean(after[:, 0] > before[:, 0] + WORSE_MM):.0%}"
     normalised = f"{math.sqrt(np.nanmean(surprise)):.2f}"
     rest = f"{is_kept.mean():.0%}", normalised, f"{np.median(took):.1f}"
-    return [name, str(len(rows)), add, right, turn, shift, along, mspd, worse, *rest]
+    return [name, str(len(rows)), add, right, turn, shift, along, mspd, shape, worse, *rest]
 
 
 def main() -> None:
@@ -221,7 +252,8 @@ def main() -> None:
         pose, took = timed(lambda given=given: method.refine(*given))  # type: ignore[misc]
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         before, after = (
-            nearest_errors(part, T, true @ group, frame.K) for T in (pose.start, pose.end)
+            (*nearest_errors(part, T, true @ group, frame.K), shape_residual(part, T, frame))
+            for T in (pose.start, pose.end)
         )
         surprise = math.nan
         if pose.covariance is not None:
@@ -234,7 +266,7 @@ def main() -> None:
             rows.setdefault(f"{name}, scale {limit:g}", []).append(row)
     print_head(
         "object", "poses", "ADD mm", "ADD-0.1d", "rotation °", "translation mm", "distance %",
-        "MSPD px", "worse by 1 mm", "kept", "normalised error", "ms",
+        "MSPD px", "shape mm", "worse by 1 mm", "kept", "normalised error", "ms",
     )  # fmt: skip
     for name, poses in rows.items():
         print_row(*medians(name, poses))

@@ -175,6 +175,20 @@ def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views, al
     assert result.detections[0].score == pytest.approx(alone.score, abs=1e-6)
 
 
+def test_weak_detection_does_not_support_an_improbable_pose(estimator, scene, views, monkeypatch):
+    """A detection that is improbable itself does not lower its view's limits of support."""
+    verified = estimator.refiner.verified
+
+    def improbable_in_the_second_view(detection, image, K, moved=0.0):
+        detection = verified(detection, image, K, moved)
+        is_second = np.array_equal(image, views[0][1])
+        return replace(detection, probability=0.03) if is_second else detection
+
+    monkeypatch.setattr(estimator.refiner, "verified", improbable_in_the_second_view)
+    (detection,) = predicted(estimator, scene, views).detections
+    assert detection.views == ["view 0"]
+
+
 def test_unrefined_detection_does_not_overrule_the_other_views(
     estimator, scene, views, true, monkeypatch
 ):

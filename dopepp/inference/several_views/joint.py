@@ -41,6 +41,9 @@ SUPPORT_LIMITS: Final = (0.5, 0.15)
 """Factor on the probability and decrease of the agreement of a view's detection, down to which the
 view also supports the joint pose."""
 
+RELIABLE: Final = 0.1
+"""Smallest probability of a detection that lowers its view's limits by :data:`SUPPORT_LIMITS`."""
+
 CONSISTENT: Final = 4.5
 """Largest Mahalanobis distance at which the covariances of two poses explain their difference."""
 
@@ -284,9 +287,10 @@ class JointEstimator:
         detection = self.refiner.verified(detection, view.image, view.K, USUAL_MOVE)
         probability, share = detection.probability or 0.0, detection.agreement or 0.0
         least, least_share = SUPPORTING, AGREEING
-        if observation is not None and not original.kept:
+        own_probability = original.probability or 0.0
+        if observation is not None and not original.kept and own_probability >= RELIABLE:
             factor, decrease = SUPPORT_LIMITS
-            least = min(least, factor * (original.probability or 0.0))
+            least = min(least, factor * own_probability)
             least_share = min(least_share, (original.agreement or 0.0) - decrease)
         is_shown = agreement is not None and probability >= least and share >= least_share
         if observation is not None and original.kept:
