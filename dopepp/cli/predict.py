@@ -111,7 +111,12 @@ def predict(
             excluded |= {"--csv": csv, "--rerun": rerun, "--show": show}
             excluded |= {"--crop": crop, "--K-size": K_size, "--topic": topic}
             _exclude("--views", {**excluded, "--stride": stride != 1})
-        terms = ("region",) if track or views else terms
+        if track or views:
+            if terms not in ((), ("region",)):
+                option = "--track" if track else "--views"
+                allowed = f"{option} with --refine region, its default"
+                raise UserError(f"{option} with --refine {refine}", allowed, "leave out --refine")
+            terms = ("region",)
         outputs: list[tuple[Path, Any]] = []
         if save is not None:
             outputs.append((save, OverlayFolder(save, stride)))

@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+THREAD_PREFIX: Final = "map_in_threads"  # of the names of threads
+
 _LIMITED: Final = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMBA_NUM")
 
 THREAD_LIMITS: Final = tuple(f"{library}_THREADS" for library in _LIMITED)
@@ -88,11 +90,12 @@ def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) ->
     """Return a function's result for each item, computed in up to :func:`num_threads` threads.
 
     The threads run at the same time only while the function has released the GIL, as compiled loops
-    and OpenCV do.
+    and OpenCV do. In one of these threads, items are computed one after the other.
     """
-    if len(items) < 2 or (count := num_threads()) < 2:
+    is_inside = threading.current_thread().name.startswith(THREAD_PREFIX)
+    if len(items) < 2 or is_inside or (count := num_threads()) < 2:
         return [function(item) for item in items]
-    with ThreadPoolExecutor(min(len(items), count)) as threads:
+    with ThreadPoolExecutor(min(len(items), count), THREAD_PREFIX) as threads:
         return list(threads.map(function, items))
 
 

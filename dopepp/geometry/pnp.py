@@ -33,6 +33,7 @@ from dopepp.geometry.refine import (
     apply_rotation,
     column_mean,
     copy_pose,
+    covariance_of,
     degenerate,
     normal_equations,
     refine_pose,
@@ -240,7 +241,7 @@ def _fit_inliers(
     carry[4, 0], carry[4, 2] = moved[2], -moved[0]
     carry[5, 0], carry[5, 1] = -moved[1], moved[0]
     # Four points on a line leave a direction undetermined: its variance is huge.
-    covariance = carry @ np.linalg.pinv(information, 1e-15) @ carry.T
+    covariance = carry @ covariance_of(information) @ carry.T
     return T, error, covariance
 
 

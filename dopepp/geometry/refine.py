@@ -39,6 +39,9 @@ _TINY_ANGLE: Final = 1e-8
 
 MIN_POINTS: Final = 4
 
+UNDETERMINED: Final = 10.0
+"""Standard deviation of a direction that measurements leave undetermined, radians or metres."""
+
 ObjectPoints = Float[np.ndarray, "n 3"]
 Rays = Float[np.ndarray, "n 2"]
 Whitenings = Float[np.ndarray, "n 2 2"]
@@ -56,6 +59,12 @@ class Points(NamedTuple):
 SMALLEST: Final = 1e-9  # Smallest valid extent of the object points, metres
 LARGEST: Final = 1e9  # Largest valid extent of the object points, metres
 SAME_PIXEL: Final = 1e-3  # Largest difference of two positions that count as equal, pixels
+
+
+@compiled()
+def covariance_of(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Invert an information matrix, after adding a prior with the deviation ``UNDETERMINED``."""
+    return np.linalg.inv(information + np.eye(len(information)) / UNDETERMINED**2)
 
 
 @compiled()

@@ -401,6 +401,7 @@ class PoseEstimator:
         image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None = None,
+        followed: bool = False,
     ) -> list[Detection]:
         """Refine detections; without a refinement, return the detections unchanged.
 
@@ -413,6 +414,7 @@ class PoseEstimator:
             image: RGB, without distortion.
             K: Camera matrix, pixels.
             depth: Metres along z, aligned to the image, 0 or NaN where unknown.
+            followed: Whether the parts were refined on the previous frame, as in tracking.
 
         Returns:
             The refined detections in the same order, with scores from before the refinement.
@@ -421,7 +423,7 @@ class PoseEstimator:
             return list(detections)
         start = time.perf_counter()
         with self.timed("refine"):
-            refine = partial(self._refined, image, K, depth, start)
+            refine = partial(self._refined, image, K, depth, followed, start)
             return map_in_threads(refine, detections)
 
     def _refined(
@@ -429,15 +431,19 @@ class PoseEstimator:
         image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None,
+        followed: bool,
         start: float,
         detection: Detection,
     ) -> Detection:
         """Refine a detection or, ``max_ms`` after ``start``, only verify its pose."""
         assert self.refiner is not None  # the caller has checked it
         if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
-            unrefined = replace(detection, kept=f"max_ms={self.max_ms:g} was spent")
+            start_pose = detection.T_cam_obj, detection.covariance
+            unrefined = replace(
+                detection, start=start_pose, kept=f"max_ms={self.max_ms:g} was spent"
+            )
             return self.refiner.verified(unrefined, image, K)
-        best = self.refiner(detection, image, K, depth)
+        best = self.refiner(detection, image, K, depth, followed)
         if detection.alternative is not None and (best.probability or 0.0) < PROBABLE:
             other = self.refiner(detection.alternative, image, K, depth)
             best = other if (other.probability or 0.0) >= PROBABLE else best

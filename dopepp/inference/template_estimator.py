@@ -176,6 +176,7 @@ class TemplateEstimator(PoseEstimator):
         image: RGBImage,
         K: CameraMatrix,
         depth: Depth | None = None,
+        followed: bool = False,
     ) -> list[Detection]:
         """Refine detections; the most probable results are refined again.
 
@@ -185,8 +186,8 @@ class TemplateEstimator(PoseEstimator):
         pose is also refined after half turns. Tracked poses are refined only once. Under a time
         limit, all poses are refined once, until the time is spent.
         """
-        if any(start.agreement is not None for start in detections):
-            return super().refined(detections, image, K, depth)
+        if followed:
+            return super().refined(detections, image, K, depth, followed)
         refine = partial(self._refined_once, image=image, K=K, depth=depth)
         if self.max_ms is not None:
             return refine(detections)

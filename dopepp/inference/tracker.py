@@ -269,7 +269,7 @@ class PoseTracker(Tracker[Detection]):
         self, estimate: Estimate[Detection], forecast: Motion
     ) -> Estimate[Detection] | None:
         start = _forecast(estimate, forecast)
-        refined = self.estimator.refined([start], self._image, self._K)[0]
+        refined = self.estimator.refined([start], self._image, self._K, followed=True)[0]
         return None if refined.kept else _estimate(refined)
 
     def _moved(

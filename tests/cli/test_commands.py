@@ -51,6 +51,8 @@ def test_predict_verifies_and_refines(run, checkpoint, image_file, tmp_path):
         (["--refine", "icp"], "refine=('icp',)"),
         (["--refine", "region,"], "refine=('region', '')"),
         (["--track", "--verify"], "--track with --verify"),
+        (["--track", "--refine", "nonsense"], "--track with --refine nonsense"),
+        (["--views", "v.yaml", "--refine", "nonsense"], "--views with --refine nonsense"),
         (["--part", "x=servoholder"], "not in the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],

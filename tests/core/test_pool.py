@@ -190,4 +190,8 @@ def test_results_of_threads_are_in_the_order_of_the_items(threads, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         map_in_threads(lambda item: 1 / item, [1, 0])
     assert map_in_threads(str, [7]) == ["7"]
+    nested = map_in_threads(
+        lambda _: set(map_in_threads(lambda _: threading.get_ident(), range(4))), range(2)
+    )
+    assert [len(identities) for identities in nested] == [1, 1]
     assert map_in_threads(str, []) == []

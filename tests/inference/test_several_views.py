@@ -1,5 +1,6 @@
 """Poses from several images of one static scene."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -155,6 +156,15 @@ def test_moved_part_is_not_averaged(estimator, scene, views, true):
     result = predicted(estimator, scene, views, images=[images[0], after])
     assert result.detections == []
     assert "the part was moved between the images" in result.findings[0]
+
+
+def test_time_limit_keeps_the_poses_of_the_network(estimator, scene, views):
+    limited = copy.copy(estimator)
+    limited.max_ms = 0.0
+    result = predicted(limited, scene, views)
+    shown = [detection for view in result.views for detection in view.detections]
+    assert {detection.kept for detection in shown} <= {"", "max_ms=0 was spent"}
+    assert result.detections or result.weaker
 
 
 def test_part_in_one_view_keeps_its_single_view_pose(estimator, scene, views, alone):

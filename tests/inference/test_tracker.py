@@ -54,7 +54,8 @@ class Stage:
         keypoints = project_keypoints(cuboid, pose, K)
         return Detection(part, 0.9, 0.8, pose, keypoints, keypoints, 0.5, np.eye(6) * 1e-6)
 
-    def refined(self, given, image, K):
+    def refined(self, given, image, K, followed):
+        assert followed
         self.refinements += len(given)
         return [self._refined(item) for item in given]
 

@@ -280,9 +280,7 @@ def _walk(mesh: OutlineMesh, posed_mesh: PosedMesh, mask: Array, spacing: float)
                 continue
             if count == len(rows):
                 longer = np.empty((2 * count, 7))
-                for k in range(count):
-                    for c in range(7):
-                        longer[k, c] = rows[k, c]
+                longer[:count] = rows
                 rows = longer
             # In perspective, the middle of an edge on the image is not its middle in space.
             zi, zj = arms[i, 2] + distance, arms[j, 2] + distance

@@ -133,8 +133,8 @@ def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView 
     """Crop a depth image around a part's points (metres); None if they are outside the image."""
     u, v = (points_cam[:, :2] / points_cam[:, 2:] * K.diagonal()[:2] + K[:2, 2]).T
     margin = MARGIN * max(np.ptp(u), np.ptp(v))
-    left, right = max(0, math.floor(u.min() - margin)), math.ceil(u.max() + margin) + 1
-    top, bottom = max(0, math.floor(v.min() - margin)), math.ceil(v.max() + margin) + 1
+    left, top = (max(0, math.floor(x.min() - margin)) for x in (u, v))
+    right, bottom = (max(0, math.ceil(x.max() + margin) + 1) for x in (u, v))
     crop = np.ascontiguousarray(depth[top:bottom, left:right], np.float32)
     if crop.size == 0:
         return None

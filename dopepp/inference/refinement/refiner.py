@@ -114,7 +114,12 @@ class Refiner:
         return None if verifier is None else verifier.mesh
 
     def __call__(
-        self, detection: Detection, image: RGBImage, K: CameraMatrix, depth: Depth | None
+        self,
+        detection: Detection,
+        image: RGBImage,
+        K: CameraMatrix,
+        depth: Depth | None,
+        followed: bool = False,
     ) -> Detection:
         """Refine and verify a detection.
 
@@ -123,19 +128,19 @@ class Refiner:
             image: RGB, without distortion.
             K: Camera matrix, pixels.
             depth: Metres along z, aligned to the image, 0 where unknown.
+            followed: Whether the part was refined on the previous frame. It keeps its probability.
 
         Returns:
             The detection at the refined pose, or at the given pose with the reason ``kept``.
         """
         refiner, cuboid = self._refiners[detection.object], self._cuboids[detection.object]
         T_cam_obj, covariance = detection.T_cam_obj, detection.covariance
-        is_tracked = detection.agreement is not None  # only refinement sets the agreement
         prior, starts = covariance, None
-        if not is_tracked and np.isfinite(detection.peaks).any():  # templates have no peaks
+        if not followed and np.isfinite(detection.peaks).any():  # templates have no peaks
             # A tracker predicts how far a part moves, but a network's covariance may be too small.
             starts = partial(poses_of_four, cuboid, detection.peaks, K)
             prior = INFLATION**2 * covariance
-        refined = refiner.refine(image, K, T_cam_obj, prior, depth, is_tracked, starts)
+        refined = refiner.refine(image, K, T_cam_obj, prior, depth, followed, starts)
         detection = replace(detection, start=(T_cam_obj, prior))
         if refined.covariance is None:
             end = replace(detection, kept=refined.reason, agreement=None, support=None)
@@ -149,7 +154,7 @@ class Refiner:
                 agreement=refined.agreement,
                 support=refined.support,
             )
-        if is_tracked:  # a tracked part keeps its probability
+        if followed:
             return end
         moved = Prior(T_cam_obj, np.linalg.inv(covariance)).squared_distance(end.T_cam_obj) ** 0.5
         return self.verified(end, image, K, moved)

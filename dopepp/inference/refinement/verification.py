@@ -469,7 +469,7 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
         x, y = pixels[edges[e, 0], 0], pixels[edges[e, 0], 1]
         dx, dy = pixels[edges[e, 1], 0] - x, pixels[edges[e, 1], 1] - y
         length = math.hypot(dx, dy)
-        while left < length and count < len(rows):
+        while left < length:
             share = left / length
             left += spacing
             u, v = x + share * dx, y + share * dy
@@ -481,6 +481,10 @@ def _walk_creases(edges: Array, sides: Array, pixels: Array, ids: Array, spacing
                         first = first or ids[row, column] == sides[e, 0]
                         second = second or ids[row, column] == sides[e, 1]
             if first and second:
+                if count == len(rows):
+                    longer = np.empty((2 * count, 4))
+                    longer[:count] = rows
+                    rows = longer
                 rows[count, 0], rows[count, 1] = u, v
                 rows[count, 2], rows[count, 3] = -dy / length, dx / length
                 count += 1

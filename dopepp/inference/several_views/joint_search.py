@@ -75,7 +75,6 @@ class JointSearch:
             T_cam_obj=T_cam_obj,
             keypoints=project_keypoints(cuboid, T_cam_obj, view.K),
             covariance=covariance,
-            agreement=None,
         )
         return make_observation(observation.view, self._refined(searched, view), view)
 

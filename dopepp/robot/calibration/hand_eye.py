@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, invert_transform, make_transform, move_pose
+from dopepp.geometry.refine import covariance_of
 from dopepp.geometry.rotation import nearest_rotation
 from dopepp.robot.calibration.board import BoardPose, Transforms
 
@@ -162,7 +163,7 @@ def refine(
     solution = least_squares(residuals, np.zeros(12), x_scale=scale, loss="soft_l1", f_scale=3.0)
     X, Y = move_pose(np.stack([X, Y]), solution.x.reshape(2, 6))
     jacobian = np.asarray(solution.jac)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)[:6, :6]
+    covariance = covariance_of(jacobian.T @ jacobian)[:6, :6]
     to_cam = np.kron(np.eye(2), X[:3, :3])
     return X, Y, to_cam.T @ covariance @ to_cam
 

@@ -20,6 +20,7 @@ from scipy.sparse import lil_matrix
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, invert_transform, move_pose, transform
 from dopepp.geometry.camera_file import Camera
+from dopepp.geometry.refine import covariance_of
 from dopepp.robot.calibration.board import (
     PIXEL_NOISE,
     BoardDetection,
@@ -210,12 +211,11 @@ class _Adjustment:
         squares = sum(float(np.square(error).sum()) for error in self._errors)
         noise = max(PIXEL_NOISE**2, squares / max(1, int(ends[-1]) - num_unknowns))
         jacobian: Any = solution.jac
-        information = (jacobian.T @ jacobian).toarray()
-        whole = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
+        whole = covariance_of((jacobian.T @ jacobian).toarray() / noise)
         self.covariances = np.zeros((self._num_cameras, 6, 6))
         for number in range(1, self._num_cameras):
             rows = slice(6 * number - 6, 6 * number)
-            self.covariances[number] = noise * whole[rows, rows]
+            self.covariances[number] = whole[rows, rows]
 
     def _residuals(self, transforms: Transforms) -> list[Float[np.ndarray, "points 2"]]:
         """Return the reprojection errors of each view in pixels."""

@@ -11,11 +11,13 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.refine import covariance_of
 from dopepp.geometry.rotation import Vector, nearest_rotation
 from dopepp.robot.calibration.board import Board
 
 MIN_POSES: Final = 4
 MAX_AMPLIFICATION: Final = 6.0  # of a pose's error in the tip: 25° between the farthest poses
+MIN_SPREAD: Final = 1e-6  # smallest assumed deviation of a touched point, metres
 MAX_RESIDUAL: Final = 0.002  # largest distance of a touched point from the fit, metres
 
 
@@ -48,8 +50,8 @@ def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
     solution, _, _, _ = np.linalg.lstsq(system, target, rcond=1e-6)
     residuals = (system @ solution - target).reshape(-1, 3)
     spread = np.sqrt((residuals**2).sum() / max(1, residuals.size - 6))
-    covariance = np.linalg.pinv(system.T @ system, rcond=1e-12)[:3, :3]
-    deviations = spread * np.sqrt(np.diag(covariance))
+    covariance = covariance_of(system.T @ system / max(spread, MIN_SPREAD) ** 2)
+    deviations = np.sqrt(np.diag(covariance)[:3])
     distances = np.linalg.norm(residuals, axis=1)
     # Mean information of a pose about the tip, after elimination of the point.
     mean = poses[:, :3, :3].mean(axis=0)

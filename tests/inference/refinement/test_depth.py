@@ -215,6 +215,13 @@ def test_visible_points_agree_with_the_drawn_depth(box):
         assert np.mean(right) > 0.85
 
 
+def test_points_beside_the_image_have_no_view():
+    depth = np.ones((480, 640), np.float32)
+    points = np.array([[-1.0, 0.0, 1.0], [-0.9, 0.1, 1.0]])
+    for turned in (points, -points * [1, 1, -1], points[:, [1, 0, 2]]):
+        assert view_around(depth, K, turned) is None
+
+
 def test_normals_of_a_thin_plate_are_those_of_its_faces():
     rng = np.random.default_rng(0)
     faces = rng.uniform(-0.04, 0.04, (2000, 2))

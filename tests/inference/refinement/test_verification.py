@@ -9,9 +9,9 @@ import trimesh
 
 from dopepp.geometry.camera import camera_matrix, make_transform, move_pose, project, transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.inference.refinement.outline import make_outline_mesh
+from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.refinement.refiner import Refiner
-from dopepp.inference.refinement.verification import EVIDENCE, Verifier, learned_model
+from dopepp.inference.refinement.verification import EVIDENCE, SharpEdges, Verifier, learned_model
 from dopepp.parts.part import make_part
 from dopepp.recovery.detection import Detection
 from dopepp.virtual.factory import Factory
@@ -68,6 +68,18 @@ def drawn_box(shade):
 
 def box_part():
     return make_part("box", mesh_of(trimesh.creation.box((0.06, 0.06, 0.06))))
+
+
+def test_all_creases_are_sampled_and_not_only_the_first():
+    teeth = [trimesh.creation.box((0.001, 0.04, 0.01)) for _ in range(20)]
+    for number, tooth in enumerate(teeth):
+        tooth.apply_translation((0.004 * number - 0.038, 0.0, 0.0))
+    part = make_part("comb", mesh_of(*teeth))
+    mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+    edges, at = SharpEdges(mesh), posed(mesh, make_transform(POSE[:3, :3], [0, 0, 0.2]), K)
+    counts = [len(edges.visible(at, edges.drawn(at, (320, 240)), step)) for step in (0.5, 4.0)]
+    assert counts[0] > 512
+    assert counts[0] == pytest.approx(8 * counts[1], rel=0.1)
 
 
 def test_a_flat_silhouette_has_an_outline_and_no_creases():

@@ -39,6 +39,7 @@ def test_the_error_of_the_tip_fits_its_deviations():
 def test_rotations_about_one_axis_do_not_determine_the_tip():
     tip = find_tip(touching(Rotation.from_rotvec(np.outer(np.linspace(0, 2, 6), [0, 0, 1])), 1e-4))
     assert "z axis" in tip.findings[0]
+    assert tip.deviations[2] > 1.0  # metres
 
 
 def test_a_touch_beside_the_point_is_a_finding():
