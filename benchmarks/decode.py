@@ -17,7 +17,8 @@ from dopepp.data.rendered import RenderedSource
 from dopepp.experiment.results.cost import likely_maps
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.inference.estimator import Maps, PoseEstimator
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import Maps, NetworkEstimator
 from dopepp.maps import MapGeometry, find_peaks
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.recovery import recover
@@ -109,7 +110,7 @@ def released(name: str, preset: str) -> tuple[float, ...]:
     return np.median(own_ms), own_peaks.mean(), np.median(noisy_ms), noisy_peaks.mean()
 
 
-def decoding(maps: Maps, K: np.ndarray, estimator: PoseEstimator) -> tuple[float, int]:
+def decoding(maps: Maps, K: np.ndarray, estimator: NetworkEstimator) -> tuple[float, int]:
     """Return the milliseconds of recovery from maps, and the number of peaks."""
     options, stride = estimator.recovery, estimator.network.stride
     geometry = MapGeometry(stride, options.sigma)

@@ -38,6 +38,7 @@ def benchmark(
     from dopepp.experiment.assembly.renders import validation_renders
     from dopepp.geometry.camera import camera_matrix
     from dopepp.inference.benchmark import time_frames
+    from dopepp.inference.network_estimator import NetworkEstimator
     from dopepp.parts.catalogue import with_meshes
 
     if (image is None) != (intrinsics is None):
@@ -48,7 +49,7 @@ def benchmark(
         estimator = options.load_estimator(path, device, unit, working_distance, tilt)
         if image is not None and intrinsics is not None:
             images = [(read_photo(image), camera_matrix(*intrinsics))]
-        elif not estimator.has_network:
+        elif not isinstance(estimator, NetworkEstimator):
             fix = "pass an image and its camera: --image FILE --K FX FY CX CY"
             raise UserError(f"{path} without --image", "an image, which a mesh requires", fix)
         else:

@@ -236,7 +236,9 @@ def _search_again(
     Returns:
         The new result, and why it has no detections (an empty string if it has any).
     """
-    if not estimator.has_network:
+    from dopepp.inference.network_estimator import NetworkEstimator
+
+    if not isinstance(estimator, NetworkEstimator):
         return result, "no pose at these distances passes the verification"
     from dopepp.inference.frames.source import Lens
     from dopepp.recovery.recover import format_reasons

@@ -16,6 +16,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.network_input import network_views
 from dopepp.inference.pose_result import STEPS
 
@@ -81,7 +82,7 @@ class ExportAgreement:
 
 
 def compare_export(
-    exported: PoseEstimator, original: PoseEstimator, images: CameraImages
+    exported: NetworkEstimator, original: NetworkEstimator, images: CameraImages
 ) -> ExportAgreement:
     """Compare maps, and the best-scored pose of each object on each image.
 

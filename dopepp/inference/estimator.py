@@ -1,15 +1,22 @@
-"""PoseEstimator: estimates poses from an image and its camera matrix, without Hydra or a config."""
+"""PoseEstimator: estimates poses from an image and its camera matrix, without Hydra or a config.
+
+:class:`PoseEstimator` contains what all estimators share: refinement, verification and score, and
+the interfaces for images, streams and several views. Subclasses detect the start poses:
+:mod:`~dopepp.inference.network_estimator` by a network, and
+:mod:`~dopepp.inference.template_estimator` by templates of a mesh.
+"""
 
 from __future__ import annotations
 
 import copy
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self, Unpack
 
 import numpy as np
 import torch
@@ -27,51 +34,47 @@ from dopepp.inference.network_input import (
     Coefficients,
     Depth,
     Distances,
-    NetworkView,
     Region,
-    merge_scales,
-    network_views,
     prepare_image,
 )
 from dopepp.inference.pose_result import STEPS
-from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.detection import CANDIDATE, PROBABLE, Detection, RecoveryOptions, recalibrate
-from dopepp.recovery.recover import Reason, explain, recover, refined_reason
+from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, recalibrate
+from dopepp.recovery.recover import Reason, refined_reason
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
     from dopepp.inference.frames import SourceLike
+    from dopepp.inference.network_estimator import NetworkEstimator
     from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.refinement.refiner import Refine
     from dopepp.inference.several_views.views_result import ViewsResult
     from dopepp.inference.stream import StreamOptions
-
-Maps = tuple[
-    Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
-]
+    from dopepp.inference.template_estimator import TemplateEstimator
 
 
 class SeenMaps(NamedTuple):
     """Belief maps of an image in one size."""
 
     K: CameraMatrix  # of the network's input, pixels
+    stride: int  # pixels of the input per cell of the maps
     belief: Float[torch.Tensor, "beliefs height width"]
     depths: list[tuple[float, float] | None] | None  # searched for each part; None: no search
 
 
-class PoseEstimator:
-    """Estimates the 6D poses of the trained parts on RGB images of any size.
+class PoseEstimator(ABC):
+    """Estimates the 6D poses of parts on RGB images of any size.
+
+    :meth:`load` makes an estimator from a checkpoint, :meth:`from_mesh` from a mesh.
 
     Args:
-        network: Trained PyTorch network, or exported network.
-        checkpoint: Parts, input size and thresholds of the network.
-        device: Device that runs the network, e.g. ``cpu`` or ``cuda``.
+        recovery: Thresholds, and the calibration of scores and covariances.
+        device: Device of the computation.
         refine: Measurements that refine poses: ``region`` (the image), ``depth`` (the depth
             image passed to :meth:`predict`), or both, ``("region", "depth")``. None: no refinement.
-        parts: The checkpoint's parts with other meshes (default: the meshes in the checkpoint).
+        parts: Parts with the meshes that refinement uses.
         max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
-            refined first; detections beyond the limit keep the network's pose.
+            refined first; detections beyond the limit keep their start pose.
         scale_error: Largest relative error of the parts' size or of the focal length (default:
             0.005). If the network's distance is certain, refinement changes it by the remaining
             difference only. Choose a small value for a calibrated camera and a measured part.
@@ -82,23 +85,16 @@ class PoseEstimator:
 
     def __init__(
         self,
-        network: runtimes.Runtime,
-        checkpoint: Checkpoint,
-        device: str | torch.device = "cpu",
-        refine: Refine | None = None,
-        parts: Sequence[Part] | None = None,
-        max_ms: float | None = None,
-        scale_error: float | None = None,
+        recovery: RecoveryOptions,
+        device: torch.device,
+        refine: Refine | None,
+        parts: Sequence[Part],
+        max_ms: float | None,
+        scale_error: float | None,
     ) -> None:
-        self.checkpoint = checkpoint
+        self.recovery, self.device = recovery, device
         self.max_ms, self.scale_error = max_ms, scale_error
-        self._refine_by(refine, parts or checkpoint.parts)
-        self.device = check_device(device)
-        self.network = runtimes.move_to_device(network, self.device)
-        self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
-        self._names = [part.name for part in checkpoint.parts]
-        self._cuboid_of = dict(zip(self._names, self.cuboids, strict=True))
-        self.recovery = RecoveryOptions.of({"sigma": checkpoint.sigma, **checkpoint.recovery})
+        self._refine_by(refine, parts)
 
     def _refine_by(self, refine: Refine | None, parts: Sequence[Part]) -> None:
         """Set the refinement, and reset the measured times."""
@@ -115,9 +111,8 @@ class PoseEstimator:
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
         """Total milliseconds by step of :data:`~dopepp.inference.pose_result.STEPS`."""
 
-    @classmethod
+    @staticmethod
     def load(
-        cls,
         path: str | Path,
         device: str | torch.device = "cpu",
         refine: Refine | None = None,
@@ -125,7 +120,7 @@ class PoseEstimator:
         max_ms: float | None = None,
         scale_error: float | None = None,
         extensions: Sequence[str] = (),
-    ) -> PoseEstimator:
+    ) -> NetworkEstimator:
         """Load a checkpoint, or a network that ``dopepp export`` wrote.
 
         Args:
@@ -143,9 +138,12 @@ class PoseEstimator:
             UserError: The file is missing, has another format or is not safe to load, an optional
                 dependency is missing, or the refinement is not possible.
         """
+        from dopepp.inference.network_estimator import NetworkEstimator
+
         enable(extensions)
         chosen = check_device(device)
-        return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms, scale_error)
+        loaded = runtimes.load(Path(path), chosen)
+        return NetworkEstimator(*loaded, chosen, refine, parts, max_ms, scale_error)
 
     @staticmethod
     def from_mesh(
@@ -158,7 +156,7 @@ class PoseEstimator:
         refine: Refine = "region",
         max_ms: float | None = None,
         scale_error: float | None = None,
-    ) -> PoseEstimator:
+    ) -> TemplateEstimator:
         """Make an estimator of one part from its mesh alone, without training.
 
         Args:
@@ -185,44 +183,51 @@ class PoseEstimator:
             [part], working_distance, tilt_deg, refine, max_ms, scale_error
         )
 
-    def refining(self, refine: Refine | None, parts: Sequence[Part] | None = None) -> PoseEstimator:
-        """Return an estimator with the same network and another refinement or other meshes."""
+    def refining(self, refine: Refine | None, parts: Sequence[Part] | None = None) -> Self:
+        """Return an estimator with the same detector and another refinement or other meshes."""
         refining = copy.copy(self)
         refining._refine_by(refine, parts or self.parts)
         return refining
 
-    def with_own_times(self) -> PoseEstimator:
-        """Return an estimator with the same network, and :attr:`spent_ms` of its own."""
+    def with_own_times(self) -> Self:
+        """Return an estimator with the same detector, and :attr:`spent_ms` of its own."""
         changed = copy.copy(self)
         changed.spent_ms = dict.fromkeys(STEPS, 0.0)
         return changed
 
     @property
+    @abstractmethod
     def parts(self) -> Sequence[Part]:
-        """Detected parts, in the order of the network's outputs."""
-        return self.checkpoint.parts
+        """Detected parts."""
+
+    @abstractmethod
+    def depth_range(self, name: str) -> tuple[float, float] | None:
+        """Return the depths (nearest, farthest) that are searched by default, metres."""
 
     @property
-    def has_network(self) -> bool:
-        """Whether a network detects the parts, rather than templates of their meshes."""
-        return True
+    @abstractmethod
+    def _detector(self) -> str:
+        """Name and input of the detector of start poses."""
 
-    def depth_range(self, name: str) -> tuple[float, float] | None:
-        """Return the depths (nearest, farthest) that are searched by default, metres.
+    @abstractmethod
+    def start_detections(
+        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
+    ) -> tuple[list[Detection], list[SeenMaps]]:
+        """Return detections before refinement, best score first, and the maps that show them."""
 
-        For a network, this is the training range; None if the checkpoint does not record it.
-        """
-        seen = self.checkpoint.seen.get(name)
-        return None if seen is None else (seen.nearest, seen.farthest)
+    @abstractmethod
+    def _missing(
+        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
+    ) -> list[Reason]:
+        """Return a reason for each part without a candidate, and each rejected start detection."""
 
     def __repr__(self) -> str:
-        """Describe the network, the parts with their depths, and the thresholds."""
-        lines = [f"PoseEstimator({self._detector}, {self.device}, refine={self.refine})"]
+        """Describe the detector, the parts with their depths, and the thresholds."""
+        lines = [f"{type(self).__name__}({self._detector}, {self.device}, refine={self.refine})"]
         for part in self.parts:
             size = " × ".join(f"{1000 * side:.0f}" for side in np.ptp(part.cuboid, axis=0))
             depths = self.depth_range(part.name)
-            verb = "learned" if self.has_network else "searched"
-            where = f", {verb} at {depths[0]:.2g} – {depths[1]:.2g} m" if depths else ""
+            where = f", at {depths[0]:.2g} – {depths[1]:.2g} m" if depths else ""
             lines.append(f"{part.name}: {size} mm{where}")
         limits = self.recovery
         lines.append(
@@ -231,13 +236,6 @@ class PoseEstimator:
             f"refined score {limits.refined_min_score:.3g}"
         )
         return "\n  ".join(lines)
-
-    @property
-    def _detector(self) -> str:
-        """Name, runtime and input size of the network."""
-        runtime, name = type(self.network).__name__, self.checkpoint.data.get("name", "network")
-        width, height = self.checkpoint.input_size
-        return f"{name} as {runtime}, {width}×{height} pixels"
 
     def predict(
         self,
@@ -300,34 +298,6 @@ class PoseEstimator:
         starts, _ = self.start_detections(image, K, distances, roi)
         return self.candidates_from(starts, image, K, depth)
 
-    def start_detections(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> tuple[list[Detection], list[SeenMaps]]:
-        """Return detections before refinement, best score first, and the maps that show them."""
-        with self.timed("pre"):
-            views = self.views(image, K, distances, roi)
-        stride, options = self.network.stride, self._recovery_options(0.0)
-        scales, seen = list[list[Detection]](), list[SeenMaps]()
-        for view in views:
-            # A second view hardly improves a probable detection, and doubles the time.
-            if view.is_further and self._detects_all_parts(scales):
-                continue
-            with self.timed("pre"):
-                pixels = view.pixels
-            with self.timed("network"):
-                belief, field = self.maps(pixels)
-            with self.timed("decode"):
-                depths = self._searched_depths(view)
-                detections = recover(
-                    belief, field, self.cuboids, view.K, stride, self._names,
-                    depths, **options,
-                )  # fmt: skip
-            scales.append(
-                [view.to_image(item, self._cuboid_of[item.object], K) for item in detections]
-            )
-            seen.append(SeenMaps(view.K, belief, depths))
-        return merge_scales(scales), seen
-
     def candidates_from(
         self,
         starts: Sequence[Detection],
@@ -340,25 +310,6 @@ class PoseEstimator:
             return list(starts)
         by_depth = depth is not None and self.refiner.uses_depth
         return self._recalibrated(self.refined(starts, image, K, depth), by_depth)
-
-    def _detects_all_parts(self, scales: Sequence[Sequence[Detection]]) -> bool:
-        """Return whether each part has a probable detection."""
-        probable = (item.object for group in scales for item in group if item.score >= PROBABLE)
-        return set(self._names) <= set(probable)
-
-    def _searched_depths(self, view: NetworkView) -> list[tuple[float, float] | None] | None:
-        """Return the depths at which :func:`recover` searches each part, metres.
-
-        A part has None if its training distances are unknown. Without verification, which chooses
-        between the poses, nothing is searched, and the result is None.
-        """
-        if self.refiner is None or not self.refiner.verifies:
-            return None
-        seen = self.checkpoint.seen
-        return [
-            view.depths(seen[part.name], part.diameter) if part.name in seen else None
-            for part in self.parts
-        ]
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Replace scores and covariances by those fitted for refined poses; see `recalibrate`."""
@@ -373,8 +324,8 @@ class PoseEstimator:
         is_verified = self.refiner is not None and self.refiner.verifies
         return self.recovery.refined_min_score if is_verified else self.recovery.min_score
 
-    def reporting(self, min_score: float | None) -> PoseEstimator:
-        """Return an estimator with the same network and another minimum score.
+    def reporting(self, min_score: float | None) -> Self:
+        """Return an estimator with the same detector and another minimum score.
 
         Args:
             min_score: New :attr:`min_score`, in [0, 1]; None keeps the threshold.
@@ -529,40 +480,6 @@ class PoseEstimator:
         candidates = self.candidates(image, K, None, depth, distances, roi, cropped)
         rejected = [candidate for candidate in candidates if candidate.score < self.min_score]
         return reasons + [refined_reason(candidate, self.min_score) for candidate in rejected]
-
-    def _missing(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> list[Reason]:
-        """Return a reason for each part without a candidate, and each rejected start detection."""
-        stride, options = self.network.stride, self._recovery_options(self.min_score)
-        reasons: list[Reason] = []
-        for view in self.views(image, K, distances, roi):
-            belief, field = self.maps(view.pixels)
-            reasons += explain(belief, field, self.cuboids, view.K, stride, self._names, **options)
-        return reasons
-
-    def views(
-        self,
-        image: RGBImage,
-        K: CameraMatrix,
-        distances: Distances | None = None,
-        roi: Region | None = None,
-    ) -> list[NetworkView]:
-        """Return the inputs of the network for an image; see :meth:`predict` for the arguments."""
-        multiple = self.network.size_multiple
-        return network_views(self.checkpoint, multiple, image, K, distances, roi)
-
-    def maps(self, image: RGBImage) -> Maps:
-        """Return belief and field maps of an RGB image (sides: multiples of ``size_multiple``)."""
-        pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
-        with torch.inference_mode():
-            belief, field = self.network.maps(pixels)
-        return belief[0].float(), field[0].float()
-
-    def _recovery_options(self, min_score: float) -> dict[str, float]:
-        """Return the options of the recovery; with refinement, the threshold is `CANDIDATE`."""
-        threshold = min_score if self.refiner is None else CANDIDATE
-        return vars(replace(self.recovery, min_score=threshold))
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:

@@ -33,6 +33,7 @@ from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.parts.size import part_in_words
 from dopepp.recovery.recover import format_reasons
@@ -123,7 +124,7 @@ def make_page(estimator: PoseEstimator, folder: Path) -> gr.Blocks:
                 image = gr.File(label=formats, height=160, elem_id="image")
                 camera = _camera_inputs()
                 button = gr.Button("Find poses", variant="primary")
-                maps = _image("Belief maps", "maps", estimator.has_network)
+                maps = _image("Belief maps", "maps", isinstance(estimator, NetworkEstimator))
             with gr.Column(scale=2, min_width=480):
                 greeting = _message("Drop an image, specify its camera, and find the poses.")
                 message = gr.HTML(greeting, padding=False)
@@ -169,10 +170,10 @@ def _outputs(
     camera = _camera(kind, inputs, *size).for_picture(size)
     image, K = camera.undistorted(photo), camera.K
     (detections, weaker), remark = estimator.split(estimator.candidates(image, K)), ""
-    if not detections and estimator.has_network:
+    if not detections and isinstance(estimator, NetworkEstimator):
         detections, weaker = estimator.split(estimator.candidates(image, K, distances="any"))
         remark = " (not at the trained sizes, but in a search at all sizes)"
-    if not detections and estimator.has_network:
+    if not detections and isinstance(estimator, NetworkEstimator):
         remark = f": {format_reasons(estimator.explain(image, K))}"
     shapes = {part.name: make_shape(part) for part in estimator.parts}
     shared: dict[str, Any] = {"shapes": shapes, "weaker": weaker, "min_score": estimator.min_score}
@@ -191,7 +192,7 @@ def _outputs(
         area = cv2.INTER_AREA
         drawn = np.asarray(cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=area))
     summary = _message(f"{result.summary}{remark}", is_error=not detections)
-    maps = belief_sheet(estimator, image, K) if estimator.has_network else None
+    maps = belief_sheet(estimator, image, K) if isinstance(estimator, NetworkEstimator) else None
     return drawn, summary, rows, _button(file), maps
 
 
@@ -214,7 +215,7 @@ def _camera(kind: str, inputs: Sequence[Any], width: int, height: int) -> Camera
     return Camera(None, camera_matrix(fx, fy, cx, cy), (), "K")
 
 
-def belief_sheet(estimator: PoseEstimator, image: RGBImage, K: CameraMatrix) -> RGBImage:
+def belief_sheet(estimator: NetworkEstimator, image: RGBImage, K: CameraMatrix) -> RGBImage:
     """Draw the belief maps over the image at every size that the network processes."""
     tiles = []
     for view in estimator.views(image, K):

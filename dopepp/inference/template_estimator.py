@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal, NoReturn
+from typing import Final, Literal
 
 import numpy as np
 import torch
@@ -91,13 +91,11 @@ class TemplateEstimator(PoseEstimator):
     ) -> None:
         self.detectors, self.distances = tuple(detectors), distances
         self._detector_of = {detector.part.name: detector for detector in detectors}
-        self.max_ms = max_ms
-        self.scale_error = SCALE_ERROR if scale_error is None else scale_error
         self.levels: dict[str, float] = {}
         """Log odds of ``Detection.probability`` at which a pose has the score 0.5, by part name."""
-        self.device = torch.device("cpu")
-        self.recovery = RecoveryOptions.of(learned_ranking().score)
-        self._refine_by(refine, self.parts)
+        recovery, cpu = RecoveryOptions.of(learned_ranking().score), torch.device("cpu")
+        scale_error = SCALE_ERROR if scale_error is None else scale_error
+        super().__init__(recovery, cpu, refine, self.parts, max_ms, scale_error)
 
     @classmethod
     def of_parts(
@@ -143,11 +141,6 @@ class TemplateEstimator(PoseEstimator):
     def parts(self) -> Sequence[Part]:
         """Detected parts."""
         return tuple(detector.part for detector in self.detectors)
-
-    @property
-    def has_network(self) -> bool:
-        """False: templates detect the parts."""
-        return False
 
     def depth_range(self, name: str) -> tuple[float, float] | None:
         """Return the working distance, metres."""
@@ -291,24 +284,6 @@ class TemplateEstimator(PoseEstimator):
             return self.distances
         return check("distances", distances, tuple[float, float], METRES)
 
-    @property
-    def network(self) -> NoReturn:  # type: ignore[override]
-        """Not available.
-
-        Raises:
-            UserError: Templates have no network.
-        """
-        raise _networks_only("a network")
-
-    @property
-    def checkpoint(self) -> NoReturn:  # type: ignore[override]
-        """Not available.
-
-        Raises:
-            UserError: Templates have no checkpoint.
-        """
-        raise _networks_only("a checkpoint")
-
 
 def _refined_again(
     detector: TemplateDetector, end: Detection, K: CameraMatrix, refine: RefineOnce
@@ -374,10 +349,3 @@ def load_solid_part(
         return part
     discrete, continuous = find_symmetries(part.mesh)
     return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
-
-
-def _networks_only(noun: str) -> UserError:
-    """Return the error about a feature that only networks have."""
-    fix = "train the part (python train.py experiment=my_part), and pass the checkpoint"
-    problem = f"{noun}, which a template estimator does not provide"
-    return UserError(problem, "an estimator with a trained network", fix)

@@ -26,6 +26,7 @@ from dopepp.geometry.cuboid import CENTROID, EDGES
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import FrameSource
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.pose_result import AXIS, COLOURS, PoseResult, silhouette_contours
 from dopepp.recovery.detection import Detection
 
@@ -189,7 +190,7 @@ def belief_images(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, 
 
     The network runs again, on the largest of its image sizes.
     """
-    if not estimator.has_network:
+    if not isinstance(estimator, NetworkEstimator):
         return {}
     view = max(estimator.views(result.image, result.K), key=lambda view: view.box.scale_x)
     beliefs = estimator.maps(view.pixels)[0].cpu().numpy()

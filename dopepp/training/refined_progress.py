@@ -12,7 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from dopepp.core.files import write_png
 from dopepp.data.sample import SampleSource
 from dopepp.drawing.curves import RateCurve, figure_image, rates_figure
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.refinement.refiner import Refine
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN, PoseMetrics
@@ -101,14 +101,14 @@ class RefinedProgress(Callback):
             self._draw(Path(trainer.default_root_dir))
         return reached
 
-    def _estimator(self, system: PoseSystem) -> PoseEstimator:
+    def _estimator(self, system: PoseSystem) -> NetworkEstimator:
         checkpoint = parse_description(system.payload)
         network = system.network.for_inference()
-        estimator = PoseEstimator(network, checkpoint, system.device, self.refine, system.parts)
+        estimator = NetworkEstimator(network, checkpoint, system.device, self.refine, system.parts)
         return estimator.reporting(MIN_SCORE)
 
     def _measure(
-        self, estimator: PoseEstimator, metrics: PoseMetrics, first: int, end: int
+        self, estimator: NetworkEstimator, metrics: PoseMetrics, first: int, end: int
     ) -> tuple[float, int, float]:
         """Add images ``first`` to ``end`` − 1; return recall, number of instances and precision."""
         for index in range(first, min(end, len(self.images))):

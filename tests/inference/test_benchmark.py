@@ -11,7 +11,7 @@ import torch
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.benchmark import WARM_UP, compare_export, time_frames
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
@@ -102,7 +102,7 @@ class Slow:
 def test_timing_of_first_frame_and_steps(tiny_spec):
     network = build_network(tiny_spec).eval()
     rest = [pivconnector()], (64, 64), 8, 1.0, {"centroid_threshold": 1.0}
-    estimator = PoseEstimator(Slow(network), Checkpoint(tiny_spec, network.state_dict(), *rest))
+    estimator = NetworkEstimator(Slow(network), Checkpoint(tiny_spec, network.state_dict(), *rest))
     images = [(np.zeros((64, 64, 3), np.uint8), camera_matrix(64, 64, 31.5, 31.5))] * 2
     timing = time_frames(estimator, images, 4)
     assert estimator.network.calls == 1 + WARM_UP + 4

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from dopepp import PoseEstimator
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.diagnosis import CHECKS, Case, diagnose
 from dopepp.inference.diagnosis.case import clipped_share, edge_width, highlights
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.models.checkpoint import load_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
@@ -162,7 +162,9 @@ def test_part_without_mesh_or_trained_sizes_is_diagnosed(factory):
     checkpoint.parts[0] = replace(checkpoint.parts[0], mesh=None)
     rendered = factory.render(0, 0)
     for image in (rendered.image, np.full_like(rendered.image, 90)):
-        case = Case(PoseEstimator(network, checkpoint), image, rendered.scene.K, checkpoint.parts)
+        case = Case(
+            NetworkEstimator(network, checkpoint), image, rendered.scene.K, checkpoint.parts
+        )
         findings = {finding.subject: finding for finding in diagnose(case)}
         assert "does not record the trained sizes" in findings["size"].sentence
         assert (findings["visibility"].fix == "") == (image is rendered.image)

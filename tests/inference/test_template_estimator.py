@@ -135,7 +135,7 @@ def test_template_estimator_tracks_and_streams(near_truth, estimator, rendered, 
 def test_repr_states_part_distances_and_thresholds(estimator):
     text = repr(estimator)
     assert "templates of meshes, cpu, refine=region" in text
-    assert "pivconnector: 105 × 52 × 7 mm, searched at 0.08 – 0.2 m" in text
+    assert "pivconnector: 105 × 52 × 7 mm, at 0.08 – 0.2 m" in text
 
 
 def test_options_reach_the_part_and_the_detector(near_truth, tmp_path):
@@ -175,13 +175,6 @@ def test_wrong_options_are_rejected(near_truth, tmp_path, options, words):
         PoseEstimator.from_mesh(mesh, **{"working_distance": (NEAR, FAR), **options})
 
 
-@pytest.mark.parametrize("name", ["network", "checkpoint"])
-def test_features_of_networks_are_rejected(estimator, rendered, name):
-    with pytest.raises(UserError, match=f"a {name}, which a template estimator.*train"):
-        getattr(estimator, name)
-    with pytest.raises(UserError, match="a network, which a template estimator"):
-        estimator.maps(rendered.image)
-    with pytest.raises(UserError, match="a network, which a template estimator"):
-        estimator.views(rendered.image, rendered.scene.K)
+def test_templates_are_always_refined(estimator):
     with pytest.raises(UserError, match="refine=None"):
         estimator.refining(None)

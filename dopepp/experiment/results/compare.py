@@ -54,6 +54,7 @@ from dopepp.experiment.results.pages import write_page
 from dopepp.experiment.results.paper import PaperTable, write_paper_table
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.models.checkpoint import find
 from dopepp.recovery.detection import Detection
 
@@ -244,7 +245,7 @@ class _Model:
 
     def __init__(self, entry: Entry, parts: tuple[str, ...]) -> None:
         self.name, self.reason = entry.name, entry.failure
-        self.estimator: PoseEstimator | None = None
+        self.estimator: NetworkEstimator | None = None
         self.run = next((run for run in entry.runs if _parts(run) == parts), entry.runs[0])
         path = self.run.checkpoint
         try:

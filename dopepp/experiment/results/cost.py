@@ -35,7 +35,7 @@ from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
 from dopepp.experiment.results.pages import write_run_readme
 from dopepp.geometry.camera import Letterbox
-from dopepp.inference.estimator import Maps, PoseEstimator
+from dopepp.inference.network_estimator import Maps, NetworkEstimator
 from dopepp.inference.network_input import resize_and_pad
 from dopepp.maps.codec import MapGeometry
 from dopepp.models.network import network_cost
@@ -93,7 +93,7 @@ class NetworkCost:
         }
 
 
-class SimulatedMapsEstimator(PoseEstimator):
+class SimulatedMapsEstimator(NetworkEstimator):
     """Estimator that runs its network but recovers poses from the maps in ``answer``."""
 
     answer: Maps  # for the next prediction, on the device of the estimator
@@ -183,7 +183,7 @@ def time_frames(
 
 
 def likely_maps(
-    sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
+    sample: Sample, estimator: NetworkEstimator, geometry: MapGeometry, generator: torch.Generator
 ) -> Maps:
     """Simulate a trained network's maps of an image: the true poses' maps, with noise."""
     size = estimator.checkpoint.input_size
@@ -218,7 +218,7 @@ def save_frame_rates(path: Path, frames: Mapping[str, pd.DataFrame]) -> None:
 
 
 @torch.inference_mode()
-def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, int]) -> float:
+def _frames_per_s(estimator: NetworkEstimator, batch_size: int, size: tuple[int, int]) -> float:
     """Return the network's frames per second in its fastest pass over random images."""
     device = estimator.device
     shape = (batch_size, 3, size[1], size[0])

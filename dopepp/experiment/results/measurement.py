@@ -31,6 +31,7 @@ from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.report import Cost, Fingerprint, Report
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.runtimes import ExportedNetwork
 from dopepp.metrics.localisation import BopScores, Draw, Localisation
 from dopepp.metrics.pose import PoseMetrics, PredictedPose
@@ -105,7 +106,7 @@ class EstimatorMethod:
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Return the number of parameters, the operations and the median time per frame."""
         milliseconds = _median_ms(seconds[_WARM_UP_FRAMES:] or seconds)
-        if not self.estimator.has_network:
+        if not isinstance(self.estimator, NetworkEstimator):
             return Cost(ms_per_frame=milliseconds)
         checkpoint, network = self.estimator.checkpoint, self.estimator.network
         if isinstance(network, ExportedNetwork):  # an export has no modules to count

@@ -38,6 +38,7 @@ from dopepp.experiment.results.measurement import (
 )
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Parts
@@ -78,7 +79,7 @@ def measure_and_record(
     methods: dict[str, Method] = {}
     for name, estimator in estimators.items():
         methods[name] = EstimatorMethod(estimator, parts)
-        if refine is not None and estimator.has_network:
+        if refine is not None and isinstance(estimator, NetworkEstimator):
             refined = " + ".join([name, *refine_terms(refine)])
             methods[refined] = EstimatorMethod(refining(estimator, refine, parts), parts)
     methods |= files
@@ -151,7 +152,7 @@ def main_report(reports: Sequence[Report]) -> Report:
     return next((report for report in reports if report.refined is not None), reports[-1])
 
 
-def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
+def refining(estimator: NetworkEstimator, refine: Refine | None, parts: Parts) -> NetworkEstimator:
     """Return a copy of an estimator that refines its poses; without ``refine``, the estimator."""
     if refine is None:
         return estimator
@@ -228,7 +229,9 @@ def _show_rejections(
     """Print, by estimator, the number of images without a detection (``silent``), and why."""
     for name, numbers in silent.items():
         method = methods[name]
-        if numbers and isinstance(method, EstimatorMethod) and method.estimator.has_network:
+        if not numbers or not isinstance(method, EstimatorMethod):
+            continue
+        if isinstance(method.estimator, NetworkEstimator):
             reasons = [method.rejection(source.sample(number, 0)) for number in numbers]
             line = summary([reason for reason in reasons if reason is not None], len(source))
             display.console.print(f"{name}: {line}")

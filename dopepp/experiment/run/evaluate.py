@@ -30,6 +30,7 @@ from dopepp.experiment.results.recording import (
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.runtimes import is_export
 from dopepp.inference.template_estimator import TemplateEstimator
 from dopepp.models.network import PoseNetwork
@@ -42,7 +43,7 @@ _log = logging.getLogger(__name__)
 
 
 def tune_and_record(
-    estimator: PoseEstimator,
+    estimator: NetworkEstimator,
     path: Path,
     parts: Parts,
     data: DataConfig,
@@ -163,7 +164,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     return reports
 
 
-def _load(options: EvaluationConfig) -> list[PoseEstimator]:
+def _load(options: EvaluationConfig) -> list[NetworkEstimator]:
     """Load the estimators of ``baseline`` and ``ckpt_path``, if set, in this order."""
     paths = [path for path in (options.baseline, options.ckpt_path) if path is not None]
     device = options.device
@@ -174,10 +175,10 @@ def _load(options: EvaluationConfig) -> list[PoseEstimator]:
 
 
 def _methods(
-    options: EvaluationConfig, loaded: Sequence[PoseEstimator], parts: Parts
+    options: EvaluationConfig, loaded: Sequence[NetworkEstimator], parts: Parts
 ) -> tuple[dict[str, PoseEstimator], dict[str, Path]]:
     """Return the estimators (networks, templates) and the files of poses to measure, by name."""
-    estimators = list(loaded)
+    estimators: list[PoseEstimator] = list(loaded)
     names = [str(estimator.checkpoint.data.get("name", "estimate")) for estimator in loaded]
     files: dict[str, Path] = {}
     if options.templates is not None:

@@ -39,6 +39,7 @@ from dopepp.experiment.run.scored_detections import (
 from dopepp.experiment.run.tuned_factors import WrongFocalLengths, fit_factors, fit_refined_factor
 from dopepp.experiment.run.tuning_cache import TuningCache
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Parts
@@ -80,7 +81,7 @@ class Tuning:
 
 
 def tune(
-    estimator: PoseEstimator, data: DataConfig, parts: Parts, target: FalsePositiveTarget
+    estimator: NetworkEstimator, data: DataConfig, parts: Parts, target: FalsePositiveTarget
 ) -> Tuning:
     """Choose factors, weights and thresholds on validation images and measure them on test images.
 

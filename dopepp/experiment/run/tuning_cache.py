@@ -10,7 +10,7 @@ from itertools import accumulate
 from typing import Any, Final, TypeVar
 
 from dopepp.data.sample import Sample, SampleSource
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.runtimes import Runtime
 from dopepp.metrics.pose import is_evaluated
 from dopepp.models.heads import Stage
@@ -54,7 +54,7 @@ class TuningCache:
             cached.length = next(reached, len(source))
         return cached
 
-    def with_cached_maps(self, estimator: PoseEstimator) -> PoseEstimator:
+    def with_cached_maps(self, estimator: NetworkEstimator) -> NetworkEstimator:
         """Return a copy of an estimator that caches the network's maps of each input."""
         network, cached = estimator.network, copy.copy(estimator)
         cached.network = _CachedNetwork(network, self, network.stride, network.size_multiple)

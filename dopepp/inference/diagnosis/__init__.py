@@ -27,6 +27,7 @@ from dopepp.inference.diagnosis.case import (
     highlights,
     num_keypoints,
 )
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.network_input import MARGIN
 from dopepp.parts.part import UNITS
 from dopepp.parts.size import is_plausible, size_in_words
@@ -95,7 +96,7 @@ def part_size(case: Case) -> Diagnosis:
                 return Diagnosis("part", f"{sizes[-1]}, and {mesh}", _unit_fix(ratio))
         if not is_plausible(part):
             fix = "pass the unit of the mesh's file: --unit mm, cm, m or inch"
-            if case.estimator.has_network:
+            if isinstance(case.estimator, NetworkEstimator):
                 fix = "train again with the unit of the mesh's file: data.unit=mm, cm, m or inch"
             return Diagnosis("part", f"{sizes[-1]}, which is unlikely", fix)
     return Diagnosis("part", "; ".join(sizes))
@@ -122,7 +123,7 @@ def sharpness(case: Case) -> Diagnosis:
         return Diagnosis("sharpness", "too few edges to measure the sharpness")
     size = f"{case.box.width}×{case.box.height}"
     width_image = width / case.box.scale_x
-    owner = "network's" if case.estimator.has_network else "templates'"
+    owner = "network's" if isinstance(case.estimator, NetworkEstimator) else "templates'"
     sentence = f"edges {width_image:.1f} pixels wide, {width:.1f} in the {owner} {size}"
     if width <= MAX_EDGE_WIDTH:
         return Diagnosis("sharpness", sentence)
@@ -174,7 +175,7 @@ def size(case: Case) -> Diagnosis:
 def visibility(case: Case) -> Diagnosis:
     """Check how many keypoints of the part the network detects."""
     name = case.part.name
-    if not case.estimator.has_network:
+    if not isinstance(case.estimator, NetworkEstimator):
         if case.detection is not None:
             return Diagnosis("visibility", f"{name} is detected, score {case.detection.score:.2g}")
         problem = f"no pose of {name} passes the verification"
@@ -215,7 +216,8 @@ def elsewhere(case: Case) -> Diagnosis:
     counts = f"{len(case.unexpected)} of {len(case.reported)} detections"
     counts += f" above {threshold:.2g} are {where}"
     best_score = f"the best has the score {best.score:.2g}, at ({u:.0f}, {v:.0f})"
-    fix = TUNE if case.estimator.has_network else "raise the threshold: --conf, or train the part"
+    is_trained = isinstance(case.estimator, NetworkEstimator)
+    fix = TUNE if is_trained else "raise the threshold: --conf, or train the part"
     return Diagnosis("elsewhere", f"{counts}; {best_score}", fix)
 
 
@@ -226,7 +228,7 @@ def pose(case: Case) -> Diagnosis:
     detection, refined, name = case.detection, case.refined, case.part.name
     share = detection.reprojection_error_px / case.length_px
     sentence = f"{name} has a reprojection error of {detection.reprojection_error_px:.1f} pixels"
-    if not case.estimator.has_network:
+    if not isinstance(case.estimator, NetworkEstimator):
         sentence = f"{name} is {case.length_px:.0f} pixels long"
     if share > MAX_ERROR:
         fix = "check K and the mesh; if both are correct, train longer or with more such images"
@@ -261,6 +263,7 @@ def _lens_ratio(case: Case) -> float | None:
     """
     if case.seen is None or case.distances is not None or case.detection is None:
         return None
+    assert isinstance(case.estimator, NetworkEstimator)  # templates have learned no range
     learned = Letterbox.fit(case.image.shape[1::-1], case.estimator.checkpoint.input_size)
     length, z = case.length_px * learned.scale_x, float(case.detection.T_cam_obj[2, 3])
     smallest, largest, near, far = case.seen

@@ -16,6 +16,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.parts.part import Part
 from dopepp.parts.size import LearnedRange
 from dopepp.recovery.detection import Detection
@@ -81,7 +82,7 @@ class Case:
         near, far = zip(usual, self.distances or usual, strict=True)
         detections = self._detections((min(near) / NEARER, max(far) * FARTHER))
         detection = detections[0] if detections else None
-        if not self.estimator.has_network:
+        if not isinstance(self.estimator, NetworkEstimator):
             return detection
         belief, keypoints = MIN_EVIDENCE
         if detection is None or not np.isfinite(detection.keypoints).all():
@@ -103,7 +104,7 @@ class Case:
     @property
     def seen(self) -> LearnedRange | None:
         """Diameters (pixels) and depths (metres) of the part in training; None if unknown."""
-        if not self.estimator.has_network:
+        if not isinstance(self.estimator, NetworkEstimator):
             return None
         return self.estimator.checkpoint.seen.get(self.part.name)
 
@@ -116,7 +117,7 @@ class Case:
     @cached_property
     def box(self) -> Letterbox:
         """Resizing that shows the part closest to its trained size; for templates, at full size."""
-        if not self.estimator.has_network:
+        if not isinstance(self.estimator, NetworkEstimator):
             return Letterbox.scaled(self.image.shape[1::-1], 1.0)
         boxes = [view.box for view in self.estimator.views(self.image, self.K, self.distances)]
         if self.detection is None or self.seen is None:
@@ -149,6 +150,7 @@ class Case:
 
     def strongest_beliefs(self) -> Float[np.ndarray, "9"]:
         """Return the strongest belief of each keypoint of the part in all image sizes."""
+        assert isinstance(self.estimator, NetworkEstimator)  # templates have no maps
         number = [part.name for part in self.estimator.parts].index(self.part.name)
         channels = slice(number * NUM_KEYPOINTS, (number + 1) * NUM_KEYPOINTS)
         strongest = np.zeros(NUM_KEYPOINTS)

@@ -67,8 +67,8 @@ class JointSearch:
         T_world_obj = self._search(detection.object).pose(
             transform(invert_transform(view.T_cam_world), tried)
         )
-        cuboid, focal_px = self.estimator.cuboids[number], focal_length(seen[0].K)
-        T_cam_obj, stride = view.pose(T_world_obj), self.estimator.network.stride
+        cuboid, focal_px = self.estimator.parts[number].cuboid, focal_length(seen[0].K)
+        T_cam_obj, stride = view.pose(T_world_obj), seen[0].stride
         covariance = search_covariance(T_cam_obj, cuboid, focal_px, stride)
         searched = replace(
             detection,
@@ -93,11 +93,14 @@ class JointSearch:
         """Return the search of a part in the maps of all views, prepared once."""
         if name not in self._searches:
             number = self._numbers[name]
-            cuboid, stride = self.estimator.cuboids[number], self.estimator.network.stride
+            cuboid = self.estimator.parts[number].cuboid
             channels = slice(number * len(cuboid), (number + 1) * len(cuboid))
             posed = [
                 PosedMaps(
-                    item.belief[channels].float().cpu().numpy(), item.K, stride, view.T_cam_world
+                    item.belief[channels].float().cpu().numpy(),
+                    item.K,
+                    item.stride,
+                    view.T_cam_world,
                 )
                 for view, seen in zip(self.views, self.maps, strict=True)
                 for item in seen

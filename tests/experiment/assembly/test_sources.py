@@ -18,7 +18,7 @@ from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import measure_and_record
 from dopepp.experiment.run.evaluate import parts_of
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.metrics.row import shown_columns
 
 
@@ -82,7 +82,7 @@ def test_an_object_without_ground_truth_in_the_test_set_has_no_rates(tiny, ycb_r
     objects = "data.objects=[003_cracker_box,010_potted_meat_can]"
     config = tiny("data=hybrid", "virtual.preset=null", f"data.root={ycb_root}", objects)
     data = replace(config.data, frames=("0050/000003",))
-    estimator = PoseEstimator(*build_untrained(config, build_parts(data)))
+    estimator = NetworkEstimator(*build_untrained(config, build_parts(data)))
     parts = parts_of([estimator], data)
     (report,) = measure_and_record({"dopepp": estimator}, parts, data, tmp_path, num_pictures=1)
     present, absent = (report.rows[name] for name in ("003_cracker_box", "010_potted_meat_can"))

@@ -26,6 +26,7 @@ from dopepp.experiment.run.tuning_cache import TuningCache
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
@@ -338,7 +339,7 @@ def test_a_network_runs_once_per_image(tiny_spec):
     network = build_network(tiny_spec)
     part = load_part("servoholder")
     checkpoint = Checkpoint(tiny_spec, network.state_dict(), [part], (64, 64), 8, 1.0, {})
-    estimator = PoseEstimator(network, checkpoint)
+    estimator = NetworkEstimator(network, checkpoint)
     passes: list[int] = []
     estimator.network.register_forward_hook(lambda *_: passes.append(1))
     cached = TuningCache().with_cached_maps(estimator)
