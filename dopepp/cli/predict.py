@@ -241,7 +241,7 @@ def _search_again(
     if not isinstance(estimator, NetworkEstimator):
         return result, "no pose at these distances passes the verification"
     from dopepp.inference.frames.source import Lens
-    from dopepp.recovery.recover import format_reasons
+    from dopepp.recovery.reasons import format_reasons
 
     image, K, depth = result.image, result.K, options["depth"]
     metres = None if depth is None else Lens(camera).read_depth(depth, options["depth_scale"], K)

@@ -33,7 +33,6 @@ from dopepp.geometry.refine import (
     apply_rotation,
     column_mean,
     copy_pose,
-    covariance_of,
     degenerate,
     normal_equations,
     refine_pose,
@@ -240,8 +239,7 @@ def _fit_inliers(
     carry[3, 1], carry[3, 2] = -moved[2], moved[1]
     carry[4, 0], carry[4, 2] = moved[2], -moved[0]
     carry[5, 0], carry[5, 1] = -moved[1], moved[0]
-    # Four points on a line leave a direction undetermined: its variance is huge.
-    covariance = carry @ covariance_of(information) @ carry.T
+    covariance = carry @ np.linalg.pinv(information, 1e-15) @ carry.T
     return T, error, covariance
 
 

@@ -39,7 +39,7 @@ _TINY_ANGLE: Final = 1e-8
 
 MIN_POINTS: Final = 4
 
-UNDETERMINED: Final = 10.0
+UNDETERMINED: Final = 1e3
 """Standard deviation of a direction that measurements leave undetermined, radians or metres."""
 
 ObjectPoints = Float[np.ndarray, "n 3"]
@@ -61,10 +61,9 @@ LARGEST: Final = 1e9  # Largest valid extent of the object points, metres
 SAME_PIXEL: Final = 1e-3  # Largest difference of two positions that count as equal, pixels
 
 
-@compiled()
 def covariance_of(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Invert an information matrix, after adding a prior with the deviation ``UNDETERMINED``."""
-    return np.linalg.inv(information + np.eye(len(information)) / UNDETERMINED**2)
+    return np.asarray(np.linalg.inv(information + np.eye(len(information)) / UNDETERMINED**2))
 
 
 @compiled()

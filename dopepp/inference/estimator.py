@@ -40,7 +40,7 @@ from dopepp.inference.network_input import (
 from dopepp.inference.pose_result import STEPS
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, recalibrate
-from dopepp.recovery.recover import Reason, refined_reason
+from dopepp.recovery.reasons import Reason, refined_reason
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera

@@ -24,7 +24,8 @@ from dopepp.inference.network_input import (
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import CANDIDATE, PROBABLE, Detection, RecoveryOptions
-from dopepp.recovery.recover import Reason, explain, recover
+from dopepp.recovery.reasons import Reason
+from dopepp.recovery.recover import explain, recover
 
 if TYPE_CHECKING:
     from dopepp.inference.refinement.refiner import Refine

@@ -36,7 +36,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.parts.size import part_in_words
-from dopepp.recovery.recover import format_reasons
+from dopepp.recovery.reasons import format_reasons
 
 HOST: Final = "127.0.0.1"  # reachable from this machine only
 MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels

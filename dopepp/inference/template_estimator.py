@@ -46,7 +46,7 @@ from dopepp.recovery.detection import (
     recalibrate,
     to_probability,
 )
-from dopepp.recovery.recover import Reason
+from dopepp.recovery.reasons import Reason
 
 NUM_REFINED: Final = 20  # number of start poses of each part that are refined
 NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable

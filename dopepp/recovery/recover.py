@@ -2,70 +2,33 @@
 
 Training, evaluation, estimators and exported runtimes all call :func:`recover` or
 :func:`recover_batch`: find peaks, associate them to instances, solve PnP, score the detections.
-A :class:`Reason` describes why an object, or one candidate of it, is not detected. To add a reason,
-add its kind to :data:`KINDS`, in the order of these steps.
+:mod:`~dopepp.recovery.reasons` describes why an object, or one candidate of it, is not detected.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from functools import cached_property, partial
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.geometry.camera import CameraMatrix
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
 from dopepp.geometry.pnp import PnPResult
 from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
-from dopepp.recovery.association import KeypointGroup, select_peaks, solve_instances
+from dopepp.recovery.association import KeypointGroup, ObjectPeaks, select_peaks, solve_instances
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, make_detection
+from dopepp.recovery.reasons import Reason, no_centroid, rejected
 from dopepp.recovery.search import MIN_BELIEF, Depths, PosedMaps, PoseSearch
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
 Belief = Float[Tensor, "beliefs height width"]
 Field = Float[Tensor, "fields height width"]
-
-Kind = Literal["empty", "centroid", "small", "pose", "score", "refined"]
-
-KINDS: Final[dict[Kind, str]] = {
-    "empty": "with empty maps (best belief {best:.2g})",
-    "centroid": "without a centroid (best belief {best:.2g})",
-    "small": "with too small a part (best belief {best:.2g})",
-    "pose": "without a pose that fits (best belief {best:.2g})",
-    "score": "below the threshold (best score {best:.3g})",
-    "refined": "below the threshold once refined (best score {best:.3g})",
-}
-"""Kinds of reasons, in the order of the steps, each with its text in :func:`summary`."""
-
-MIN_CELLS: Final = 3.0  # The peaks of a part that extends over fewer cells overlap
-
-
-@dataclass(frozen=True)
-class Reason:
-    """Why an object, or one candidate of it, is not detected.
-
-    Attributes:
-        object: Name of the object.
-        kind: Step that rejected the candidate, a key of :data:`KINDS`.
-        best: Score of the candidate; without a pose, its centroid's belief; without a candidate,
-            the highest belief of the object's centroid map or, if all nine are empty, of all nine.
-        text: Explanation in words.
-    """
-
-    object: str
-    kind: Kind
-    best: float
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.object}: {self.text}"
 
 
 def recover(
@@ -146,32 +109,55 @@ def recover_batch(
             object_peaks = select_peaks(peaks, image, c, chosen.centroid_threshold, cells, stride)
             instances = solve_instances(object_peaks, cuboid, camera, max_angle, float(stride))
             beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
-            reach = None if depths is None else depths[c]
-            search: PoseSearch | None = None  # made for the first uncertain instance
+            searched_depths = None if depths is None else depths[c]
+            candidates = _Candidates(
+                name, cuboid, camera, beliefs, stride, object_peaks, searched_depths, chosen
+            )
             for group, result in instances:
-                detection = make_detection(group, result, cuboid, camera, name, chosen)
-                is_probable = detection is not None and detection.score >= PROBABLE
-                is_clear = group.score[CENTROID] >= MIN_BELIEF
-                if reach is not None and is_clear and not is_probable:
-                    if search is None:
-                        maps = beliefs.float().cpu().numpy()
-                        posed = PosedMaps(maps, camera, stride, np.eye(4))
-                        search = PoseSearch([posed], cuboid)
-                    solved = search.solve(group, object_peaks, reach)
-                    searched = make_detection(*solved, cuboid, camera, name, chosen)
-                    if detection is None or detection.score < chosen.min_score:
-                        detection = searched
-                    else:
-                        detection = replace(detection, alternative=searched)
+                detection = candidates.detection(group, result)
                 if detection is not None and detection.score >= chosen.min_score:
                     detections.append(detection)
                 elif reasons is not None:
-                    kind, best, text = _rejected(group, result, detection, chosen, cells, stride)
-                    reasons.append(Reason(name, kind, best, text))
+                    reasons.append(rejected(name, group, result, detection, chosen, cells, stride))
             if reasons is not None and not instances:
-                reasons.append(_no_centroid(beliefs, name, chosen))
+                reasons.append(no_centroid(beliefs, name, chosen))
         batch.append(sorted(detections, key=lambda detection: -detection.score))
     return batch
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """The candidates of one object in one image."""
+
+    name: str
+    cuboid: Cuboid
+    K: CameraMatrix  # of the network's input, pixels
+    beliefs: Float[Tensor, "9 height width"]
+    stride: int
+    peaks: ObjectPeaks
+    depths: Depths | None  # searched for further poses, metres; None: no search
+    options: RecoveryOptions
+
+    def detection(self, group: KeypointGroup, result: PnPResult) -> Detection | None:
+        """Return the detection of a candidate; an uncertain one is also searched in the maps."""
+        of_object = partial(
+            make_detection, cuboid=self.cuboid, K=self.K, name=self.name, options=self.options
+        )
+        detection = of_object(group, result)
+        is_probable = detection is not None and detection.score >= PROBABLE
+        is_clear = group.score[CENTROID] >= MIN_BELIEF
+        if self.depths is None or is_probable or not is_clear:
+            return detection
+        searched = of_object(*self._search.solve(group, self.peaks, self.depths))
+        if detection is None or detection.score < self.options.min_score:
+            return searched
+        return replace(detection, alternative=searched)
+
+    @cached_property
+    def _search(self) -> PoseSearch:
+        """Search in the maps, prepared for the first uncertain candidate."""
+        maps = self.beliefs.float().cpu().numpy()
+        return PoseSearch([PosedMaps(maps, self.K, self.stride, np.eye(4))], self.cuboid)
 
 
 def explain(
@@ -208,84 +194,3 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
         )
     if K.shape != (len(belief), 3, 3):
         raise ValueError(f"{len(belief)} images need as many camera matrices, got {K.shape}")
-
-
-def _no_centroid(
-    beliefs: Float[Tensor, "9 height width"], name: str, options: RecoveryOptions
-) -> Reason:
-    """Return the reason for an object without a peak above ``options.centroid_threshold``."""
-    best = torch.nan_to_num(beliefs.detach().float()).flatten(1).amax(1)
-    highest, centroid = float(best.max()), float(best[CENTROID])
-    if highest <= options.peak_threshold:
-        return Reason(name, "empty", highest, f"its maps are empty, no belief above {highest:.2g}")
-    text = f"best belief of a centroid {centroid:.2g} below {options.centroid_threshold:g}"
-    return Reason(name, "centroid", centroid, text)
-
-
-def _rejected(
-    group: KeypointGroup,
-    result: PnPResult,
-    detection: Detection | None,
-    options: RecoveryOptions,
-    cells: tuple[int, int],
-    stride: int,
-) -> tuple[Kind, float, str]:
-    """Return the kind, ``best`` and the text of the reason for rejecting a candidate.
-
-    ``cells`` is the (width, height) of the maps.
-    """
-    kind: Kind = "pose"
-    best, text, points = float(np.nan_to_num(group.score[CENTROID])), result.reason, group.position
-    if detection is not None:
-        kind, best, points = "score", detection.score, detection.keypoints
-        text = f"score {best:.3f} below {options.min_score:.3g}"
-    points = points[np.isfinite(points).all(1)]
-    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if len(points) >= 2 and extent < MIN_CELLS * stride:
-        kind = "small"
-        text += f" (too small: {extent:.0f} px across, a cell of the maps has {stride} px)"
-    x, y = group.position[CENTROID]
-    size = f"{stride * cells[0]}×{stride * cells[1]}"  # size of the network's input
-    return kind, best, f"at pixel ({x:.0f}, {y:.0f}) of {size}: {text}"
-
-
-def refined_reason(detection: Detection, min_score: float) -> Reason:
-    """Return the reason for dropping a refined detection whose score is below ``min_score``."""
-    text = f"once refined, score {detection.score:.3f} below {min_score:.3g}"
-    text += f" ({detection.kept})" if detection.kept else ""
-    return Reason(detection.object, "refined", detection.score, text)
-
-
-def main_reasons(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return each object's reason of the latest step and highest ``best``, latest step last."""
-    order = list(KINDS)
-    best: dict[str, Reason] = {}
-    for reason in sorted(reasons, key=lambda reason: (order.index(reason.kind), reason.best)):
-        best.pop(reason.object, None)
-        best[reason.object] = reason
-    return list(best.values())
-
-
-def format_reasons(reasons: Sequence[Reason]) -> str:
-    """Return the main reason of each object on one image as a line of text, latest step first."""
-    counts = Counter(reason.object for reason in reasons)
-    lines = []
-    for reason in reversed(main_reasons(reasons)):
-        count = counts[reason.object]
-        lines.append(f"{reason} (the best of {count})" if count > 1 else str(reason))
-    return "; ".join(lines)
-
-
-def summary(silent: Sequence[Reason], num_images: int) -> str:
-    """Return a line of text with the number of reasons of each kind and their highest ``best``.
-
-    Args:
-        silent: The main reason of each image without detections.
-        num_images: Number of all images.
-    """
-    groups = []
-    for kind, words in KINDS.items():
-        values = [reason.best for reason in silent if reason.kind == kind]
-        if values:
-            groups.append(f"{len(values)} {words.format(best=max(values))}")
-    return f"{len(silent)} of {num_images} images without detections: {', '.join(groups)}"

@@ -14,7 +14,7 @@ from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.template_estimator import NUM_REFINED
 from dopepp.inference.tracker import PoseTracker
 from dopepp.parts.catalogue import pivconnector
-from dopepp.recovery.recover import format_reasons
+from dopepp.recovery.reasons import format_reasons
 from dopepp.virtual import PRESETS, Factory
 
 NEAR, FAR = 0.08, 0.2

@@ -13,7 +13,7 @@ from dopepp.maps import MapGeometry, encode
 from dopepp.maps.codec import Peaks
 from dopepp.recovery import Reason, explain, recover, recover_batch
 from dopepp.recovery.association import BORDER_DEVIATION, select_peaks
-from dopepp.recovery.recover import format_reasons, main_reasons, summary
+from dopepp.recovery.reasons import format_reasons, main_reasons, summary
 
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
 

@@ -37,7 +37,7 @@ from dopepp.metrics.localisation import BopScores, Draw, Localisation
 from dopepp.metrics.pose import PoseMetrics, PredictedPose
 from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Part, Parts
-from dopepp.recovery.recover import Reason, main_reasons
+from dopepp.recovery.reasons import Reason, main_reasons
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface

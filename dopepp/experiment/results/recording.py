@@ -42,7 +42,7 @@ from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Parts
-from dopepp.recovery.recover import summary
+from dopepp.recovery.reasons import summary
 
 
 def measure_and_record(
