@@ -53,7 +53,7 @@ def node(
         str | None, Option(help="Optical frame of the camera (default: the images' frame).")
     ] = None,
     conf: options.Conf = None,
-    refine: options.Region = None,
+    refine: options.RefineRegion = None,
     max_ms: options.MaxMs = None,
     scale_error: options.ScaleError = None,
     track: options.Track = False,

@@ -35,7 +35,9 @@ Distances = Annotated[
     tuple[float, float] | None,
     Option("--distance", help="Distance range of the parts, metres (default: the training range)."),
 ]
-Region = Annotated[str | None, Option("--refine", help="region: refine the poses on the image.")]
+RefineRegion = Annotated[
+    str | None, Option("--refine", help="region: refine the poses on the image.")
+]
 Conf = Annotated[
     float | None,
     Option(help="Minimum score of a pose, 0 to 1 (default: the checkpoint's threshold)."),

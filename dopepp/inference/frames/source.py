@@ -91,6 +91,6 @@ def choose_camera(
     """
     chosen = given_camera(K, camera) or source.camera
     if chosen is None:
-        fix = "pass --K fx fy cx cy (pixels of this image) or --camera FILE"
+        fix = "pass --K fx fy cx cy (pixels of this image) or --camera FILE; in Python, K or camera"
         raise UserError(f"neither --K nor --camera for {source.name}", "--K or --camera", fix)
     return chosen

@@ -95,7 +95,7 @@ class Round:
     crop: Crop  # image around the part, at the stage's resolution
     stage: RegionStage  # settings of the round
     weights: Weights  # weights of colours and edges
-    more: Sequence[Term] = ()  # solver terms in addition to the outline
+    further_terms: Sequence[Term] = ()  # solver terms in addition to the outline
     scale_error: float = SCALE_ERROR  # largest relative error of the outline's scale
 
     def __post_init__(self) -> None:
@@ -137,7 +137,7 @@ class Round:
             UndecidedError: The outline leaves the image.
         """
         # The outline term is last, because its scale error depends on the sum of all other terms.
-        end = descend(start, prior, [*self.more, self.term(reach)], self.stage.steps)
+        end = descend(start, prior, [*self.further_terms, self.term(reach)], self.stage.steps)
         if end is None:
             raise UndecidedError("the part's outline left the image")
         return end
@@ -204,7 +204,7 @@ class Round:
         )
         # Compare with the prior's pose, except for a tracked part that moved less than a pixel,
         # where noise would decide, and with further terms, which may contradict the image.
-        if not is_near and not self.more:
+        if not is_near and not self.further_terms:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
                 raise UndecidedError("the image agrees as well with the given pose")
