@@ -103,3 +103,11 @@ def test_the_shell_sees_one_line_and_code_two(command, tmp_path):
     assert "data.objects=['003_cracker_box'] without data.root" in done.line
     assert done.err.count("\n") == 1
     assert re.fullmatch("begins in .*\n", done.out)
+
+
+def test_a_failed_job_of_an_evaluation_multirun_ends_it_with_code_1(call, tmp_path):
+    files = "ckpt_path=/absent/a.ckpt,/absent/b.ckpt"
+    call("evaluate.py", "-m", files, f"output_dir={tmp_path}", code=1)
+    failures = sorted(tmp_path.glob("evaluate/*/*/failed.json"))
+    assert [path.parent.name for path in failures] == ["0", "1"]
+    assert "got /absent/b.ckpt, which is not a file" in failures[1].read_text()

@@ -66,6 +66,17 @@ class CompareJobs(Callback):
             raise SystemExit(1)
 
 
+class CheckJobs(Callback):
+    """Hydra callback that ends a multirun of ``evaluate.py`` with exit code 1 if a job failed."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Exit with code 1 if any job has written ``failed.json``."""
+        from dopepp.experiment.results.folder import FAILURE_FILE
+
+        if any(Path(str(config.hydra.sweep.dir)).glob(f"*/{FAILURE_FILE}")):
+            raise SystemExit(1)
+
+
 def compare_jobs(folder: Path, config: DictConfig) -> bool:
     """Write the comparison of a multirun's jobs; return whether each has finished or was pruned."""
     from dopepp.experiment.results import display
