@@ -38,6 +38,9 @@ def build_parts(data: DataConfig) -> list[Part]:
 def _read_parts(data: DataConfig) -> list[Part]:
     """Load the objects of ``data.root`` (YCB-Video, BOP), else the parts that ``parts`` lists."""
     if data.root is None:
+        if data.format == "bop":
+            fix = "set data.root, or train on renders of mesh files with data=virtual"
+            raise UserError(f"data={data.name} without data.root", "a BOP data set's folder", fix)
         for option, value in (("objects", data.objects), ("frames", data.frames)):
             if value is not None:
                 raise UserError(

@@ -98,6 +98,15 @@ def test_every_choice_composes(group, name, composed):
             assert node[key] == value
 
 
+@pytest.mark.parametrize("choice", [
+    "data=bop_renders", "experiment=dragon", "experiment=lmo_each", "experiment=ycb_objects",
+    "experiment=table1_real_hybrid", "experiment=table7_ycbv",
+])  # fmt: skip
+def test_a_choice_that_needs_a_data_set_is_refused_without(choice, parsed):
+    with pytest.raises(UserError, match=r"got data.* without data\.root"):
+        build_parts(parsed(choice).data)
+
+
 @pytest.mark.parametrize(
     "choice",
     [
