@@ -18,6 +18,7 @@ from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import SampleSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
+from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.photos import held_out_photos, negative_photos
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.geometry.camera import crop_camera
@@ -50,6 +51,7 @@ FRAME: Final[Size] = (640, 480)
 _MAX_DISTRACTORS: Final = 12  # per frame; limits the rendering time
 _LOOKALIKES_SHOWN: Final = (1, 3)  # smallest and largest number per frame
 _MARGIN: Final = 0.3  # border without look-alikes, share of the frame, if there is no camera
+_NUM_LABELLED: Final = 20  # number of labelled images whose distances are measured
 _NUM_POSES: Final = 64  # number of sampled poses per part for measuring the preset's distances
 
 
@@ -101,16 +103,27 @@ def negative_frames(
 def frame_view(data: DataConfig, parts: Parts) -> View:
     """Return the camera of :func:`negative_frames` and the range of distances of the parts.
 
-    The camera is ``virtual.camera`` if set. Otherwise the camera has the preset's focal length and
-    images of at least :data:`FRAME` pixels.
+    The camera is ``virtual.camera`` if set, or that of the labelled validation images. Otherwise
+    the camera has the preset's focal length and images of at least :data:`FRAME` pixels.
     """
     if data.virtual.view is not None:
         return data.virtual.view
+    if not data.is_rendered("val") and (labelled := _labelled_view(data, parts)) is not None:
+        return labelled
     preset = data.preset
     width, height = max(preset.width, FRAME[0]), max(preset.height, FRAME[1])
     K = crop_camera(preset.K, (preset.width - width) / 2, (preset.height - height) / 2)
     near, far = _distances(preset, parts)
     return View((width, height), K, (max(near, 0.02), max(far, 0.02)))
+
+
+def _labelled_view(data: DataConfig, parts: Parts) -> View | None:
+    """Return the camera and the depths of the parts in the first labelled validation images."""
+    source = held_out_source(data, parts, "val")
+    samples = [source.sample(index) for index in range(min(len(source), _NUM_LABELLED))]
+    poses = [instance.T_cam_obj for sample in samples for instance in sample.instances]
+    depths = [max(float(pose[2, 3]), 0.02) for pose in poses]
+    return View(samples[0].size, samples[0].K, (min(depths), max(depths))) if depths else None
 
 
 def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from dopepp.experiment.assembly.build_sources import (
     fit_to_camera,
     held_out_source,
 )
+from dopepp.experiment.assembly.negative_frames import frame_view, negative_frames
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.results.false_alarms import frames_without_parts
 from dopepp.geometry.camera import project_keypoints
@@ -63,6 +64,19 @@ def config(parsed, root):
         return parsed("data=bop_renders", f"data.root={root}", *given, *overrides)
 
     return make
+
+
+def test_frames_without_objects_have_the_camera_of_the_labelled_images(parsed, root, quick_sky):
+    sets = (f"data.image_sets.{split}=test" for split in ("train", "val", "test"))
+    data = parsed("data=bop", f"data.root={root}", *sets).data
+    parts = build_parts(data)
+    frames = negative_frames(data, parts, "val", 3)
+    for index in range(3):
+        sample = frames.sample(index)
+        assert sample.size == (96, 64)
+        np.testing.assert_array_equal(sample.K, [[210, 0, 47], [0, 211, 30], [0, 0, 1]])
+    near, far = frame_view(data, parts).distance
+    assert 0.40 <= near < far <= 0.60
 
 
 @pytest.mark.parametrize("symmetries", ["auto", "none"])
