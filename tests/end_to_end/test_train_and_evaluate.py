@@ -149,6 +149,16 @@ def test_other_data_must_show_the_checkpoints_objects(trained, evaluate, call, t
     assert "test data without pivconnector" in done.line
 
 
+def test_a_baseline_must_share_an_object(trained, call, tmp_path):
+    path = trained[0] / "checkpoints" / "best.ckpt"
+    other = torch.load(path, weights_only=True)
+    other["dopepp"]["parts"][0]["name"] = "cup"
+    torch.save(other, tmp_path / "cup.ckpt")
+    options = f"baseline={tmp_path / 'cup.ckpt'}", f"output_dir={tmp_path}"
+    line = call("evaluate.py", f"ckpt_path={path}", *options).line
+    assert "got a baseline of cup; allowed: one or more of pivconnector" in line
+
+
 @pytest.mark.slow
 def test_average_early_stopping_and_profiler_go_together(call, find_run, tiny, tmp_path):
     done = call(

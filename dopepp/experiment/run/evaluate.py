@@ -84,6 +84,9 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
     Unless ``data.symmetries`` is set, parts for which the test data states no symmetries have those
     of the checkpoint.
+
+    Raises:
+        UserError: The data lacks a part, or another estimator detects none of the parts.
     """
     if not estimators:
         return build_parts(data)
@@ -91,6 +94,11 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
     names = [part.name for part in trained]
     if data.root is not None and data.objects is None:
         data = replace(data, objects=tuple(names))
+    for estimator in estimators:
+        if not {part.name for part in estimator.parts} & set(names):
+            others = ", ".join(part.name for part in estimator.parts)
+            fix = "leave out the baseline, or choose a checkpoint of one of these objects"
+            raise UserError(f"a baseline of {others}", f"one or more of {', '.join(names)}", fix)
     available = {part.name: part for part in build_parts(data)}
     missing = [name for name in names if name not in available]
     if missing:
