@@ -164,7 +164,7 @@ def test_a_preview_renders_no_data_set(run, tmp_path):
         (["-n", "5", "--size", "big"], "got --size big; allowed: WIDTHxHEIGHT"),
         (["-n", "many"], "Invalid value for '-n'"),
         (["-n", "5", "--colour"], "No such option: --colour"),
-        (["-n", "5", "--backgrounds", "skimag"], "got no photo in the background folder skimag"),
+        (["-n", "5", "--backgrounds", "skimag"], "got no photo in the folder skimag"),
         (["-n", "5", "--unit", "furlong", "part.stl"], "got unit='furlong' for part.stl"),
         (["-n", "5", "servoholder"], "got parts ['servoholder', 'servoholder'] to render"),
         (["-n", "5", "--format", "coco"], "got --format coco; allowed: bop, ndds, webdataset"),

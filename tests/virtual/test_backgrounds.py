@@ -37,7 +37,7 @@ def test_a_choice_by_name(tmp_path):
     assert isinstance(find_backgrounds(None), ProceduralBackgrounds)
     assert find_backgrounds("procedural").identity() == ["procedural"]
     for folder in ("nowhere", tmp_path):
-        with pytest.raises(UserError, match="no photo in the background folder"):
+        with pytest.raises(UserError, match="no photo in the folder"):
             find_backgrounds(folder)
 
 

@@ -60,8 +60,8 @@ class PhotoBackgrounds:
         self.paths = [self.folder / name for name in sorted(photo_names)]
         if not self.paths:
             allowed = f"a folder with {', '.join(PHOTO_SUFFIXES)} files"
-            fix = "pass a folder of photos, or leave it out to use procedural backgrounds"
-            raise UserError(f"no photo in the background folder {folder}", allowed, fix)
+            fix = "pass a folder of photos, or leave out this option"
+            raise UserError(f"no photo in the folder {folder}", allowed, fix)
         self.bad: dict[Path, str] = {}
         self._photos: OrderedDict[Path, list[RGBImage]] = OrderedDict()
         self._kept_bytes = 0
