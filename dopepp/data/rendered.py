@@ -111,8 +111,7 @@ def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
 
 
 _TEXT_LENGTH: Final = 64
-_MAX_INSTANCES: Final = 40
-"""Masks are stored as a uint8 map: 0 for the background, i + 1 for instance i."""
+MAX_LABELLED: Final = 40  # instances per labelled image that a cache holds
 
 _FILLED: Final = 1 << 32  # added to a slot's CRC-32, so that only an empty slot has the checksum 0
 
@@ -130,9 +129,11 @@ class CachedSource(WrappedSource):
             keeps size and depth.
         folder: Folder of the files, in subfolders named by a hash of everything that determines the
             items (besides the source, ``identity``); None keeps the items in memory.
+        max_instances: Largest number of instances in an image, at most 255.
 
     Raises:
-        UserError: The cache needs more than half of the machine's memory, or the disk is full.
+        UserError: The cache needs more than half of the machine's memory, or the disk is full; or,
+            also in :meth:`sample`, a slot cannot hold an item.
     """
 
     def __init__(
@@ -141,13 +142,14 @@ class CachedSource(WrappedSource):
         input_size: Size | None,
         folder: Path | None = None,
         identity: str = "",
+        max_instances: int = MAX_LABELLED,
     ) -> None:
         super().__init__(source, cached=True)  # all epochs are equal
-        self._input_size = input_size
+        self._input_size, self._max_instances = input_size, max_instances
         first = self._resized(0)
         self._source_name = first.source
         self._shape, self._has_depth = first.image.shape[:2], first.depth is not None
-        slot = _slot_layout(self._shape, self._has_depth)
+        slot = _slot_layout(self._shape, self._has_depth, max_instances)
         self.num_bytes = slot.itemsize * len(source)
         self.folder = None
         if folder is None:
@@ -208,19 +210,27 @@ class CachedSource(WrappedSource):
         """Write a sample to its slot, and then the slot's checksum.
 
         Raises:
-            ValueError: A slot cannot represent the sample.
+            UserError: A slot cannot hold the sample.
         """
         texts = [sample.key, *(instance.label for instance in sample.instances)]
         layout = (self._shape, self._source_name, self._has_depth)
+        allowed = ""
         if (sample.image.shape[:2], sample.source, sample.depth is not None) != layout:
-            rule = "a cache holds images of one size and source, all with depth or all without"
-            raise ValueError(f"a {sample.size} image of {sample.source}; {rule}")
-        if len(texts) > _MAX_INSTANCES + 1 or max(map(len, texts)) > _TEXT_LENGTH:
-            most = f"at most {_MAX_INSTANCES} instances and {_TEXT_LENGTH} characters"
-            raise ValueError(f"{len(texts) - 1} instances, with names {texts}; {most}")
+            allowed = "images of one size and source, all with depth or all without"
+        elif len(texts) > self._max_instances + 1 or max(map(len, texts)) > _TEXT_LENGTH:
+            allowed = (
+                f"at most {self._max_instances} instances, and names of {_TEXT_LENGTH} letters"
+            )
+        if allowed:
+            width, height = sample.size
+            problem = (
+                f"data.cache={'memory' if self.folder is None else 'disk'} for image {sample.key} "
+                f"of {sample.source}, scaled to {width}×{height}, with {len(texts) - 1} instances"
+            )
+            raise UserError(problem, allowed, "set data.cache=none")
         slot = self._slots[index]
         slot["image"], slot["K"], slot["key"] = sample.image, sample.K, sample.key
-        labels = np.zeros(sample.image.shape[:2], np.uint8)
+        labels = np.zeros(sample.image.shape[:2], np.uint8)  # 0 for the background
         for number, instance in enumerate(sample.instances):
             record = slot["instances"][number]
             for name in ("T_cam_obj", "keypoints", "visible_fraction", "label"):
@@ -255,7 +265,7 @@ class CachedSource(WrappedSource):
         )
 
 
-def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
+def _slot_layout(shape: Shape, has_depth: bool, max_instances: int) -> np.dtype[Any]:
     """Return the dtype of a slot: one sample with an image of ``shape``."""
     instance: list[tuple[Any, ...]] = [("T_cam_obj", "f8", (4, 4)), ("keypoints", "f8", (9, 2))]
     instance += [("visible_fraction", "f8"), ("has_mask", "?"), ("label", f"U{_TEXT_LENGTH}")]
@@ -265,5 +275,5 @@ def _slot_layout(shape: Shape, has_depth: bool) -> np.dtype[Any]:
         ("K", "f8", (3, 3)),
     ]
     fields += [("key", f"U{_TEXT_LENGTH}"), ("num_instances", "i4")]
-    fields += [("instances", instance, (_MAX_INSTANCES,))]
+    fields += [("instances", instance, (max_instances,))]
     return np.dtype(fields + ([("depth", "f4", shape)] if has_depth else []))

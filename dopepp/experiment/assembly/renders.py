@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import cache_folder
-from dopepp.data.rendered import CachedSource, RenderedSource, Split
+from dopepp.data.rendered import MAX_LABELLED, CachedSource, RenderedSource, Split
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.build_parts import build_negatives
@@ -94,7 +94,10 @@ def with_cache(
     folder = None
     if cache == "disk":
         folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
-    return CachedSource(source, input_size, folder, identity=code_hash())
+    most = MAX_LABELLED
+    if isinstance(source, RenderedSource):
+        most = source.factory.preset.targets_per_image[1]
+    return CachedSource(source, input_size, folder, identity=code_hash(), max_instances=most)
 
 
 def training_preset(data: DataConfig) -> Preset:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data import rendered
 from dopepp.data.rendered import FIRST_INDEX, MAX_ITEMS, CachedSource, RenderedSource
 from dopepp.data.sample import resize_sample
 from dopepp.parts.catalogue import pivconnector, servoholder
@@ -131,20 +130,22 @@ def test_forked_processes_fill_one_cache(fake_source):
     assert source.calls == [(0, 0)]  # this process rendered the first item only
 
 
-def test_samples_that_do_not_fit_are_rejected(fake_source, monkeypatch):
+def test_samples_that_do_not_fit_are_rejected(fake_source, tmp_path):
     with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
         CachedSource(fake_source(num_items=10**9), (64, 64))
-    with pytest.raises(ValueError, match="at most 40 instances and 64 characters"):
+    fix = "set data.cache=none"
+    with pytest.raises(
+        UserError, match=f"at most 40 instances, and names of 64 letters; fix: {fix}"
+    ):
         CachedSource(fake_source(label="x" * 65), (64, 64))
     for change in ({"size": (48, 64)}, {"name": "another"}):
         source = fake_source()
         cached = CachedSource(source, (64, 64))
         vars(source).update(change)
-        with pytest.raises(ValueError, match="one size and source"):
+        with pytest.raises(UserError, match=rf"data\.cache=memory .*one size and source.*{fix}"):
             cached.sample(1)
-    monkeypatch.setattr(rendered, "_MAX_INSTANCES", 0)
-    with pytest.raises(ValueError, match=r"1 instances, .*; at most 0 instances"):
-        CachedSource(fake_source(), (64, 64))
+    with pytest.raises(UserError, match=r"data\.cache=disk for .* with 1 inst.* at most 0 inst"):
+        CachedSource(fake_source(), (64, 64), tmp_path, max_instances=0)
 
 
 def test_a_cache_file_is_reused_for_equal_content_only(fake_source, tmp_path):

@@ -7,6 +7,8 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
+from dopepp.data.rendered import RenderedSource
+from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.assembly.build_parts import PAPER_OBJECTS, build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
@@ -14,12 +16,16 @@ from dopepp.experiment.assembly.build_sources import (
     note_on_shared_folder,
 )
 from dopepp.experiment.assembly.build_system import build_untrained
+from dopepp.experiment.assembly.renders import with_cache
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.recording import measure_and_record
 from dopepp.experiment.run.evaluate import parts_of
 from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.metrics.row import shown_columns
+from dopepp.parts.catalogue import servoholder
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import preset_of
 
 
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
@@ -38,6 +44,16 @@ def test_without_a_root_all_images_are_rendered_with_one_warning(tiny, caplog):
     (line,) = [record.getMessage() for record in caplog.records]
     assert "no real images" in line
     assert "servoholder, pivconnector" in line
+
+
+def test_a_cache_holds_all_targets_that_a_preset_allows(tiny, tmp_path, monkeypatch):
+    preset = preset_of("quickstart", {"targets_per_image": [0, 60]})
+    source = RenderedSource(Factory([servoholder()], preset, 0), 2)
+    instance = Instance("servoholder", np.eye(4), np.zeros((9, 2)))
+    crowd = Sample(np.zeros((48, 64, 3), np.uint8), np.eye(3), [instance] * 60)
+    monkeypatch.setattr(source, "sample", lambda index, epoch=0: crowd)
+    data = tiny(f"data.cache_dir={tmp_path}").data
+    assert len(with_cache(source, data, "disk", (64, 64)).sample(1).instances) == 60
 
 
 def test_held_out_images_are_equal_for_all_seeds_and_differ_between_splits(tiny):
