@@ -4,6 +4,10 @@ This module decodes all photos, textures, frames, depth images and masks; a dama
 error. Pillow, unlike OpenCV, rejects truncated files and reports the size before decoding. The
 checksums of a PNG and the end of a JPEG are checked here. To accept a further raster format, add
 its name to :data:`FORMATS`.
+
+Labels and texture coordinates refer to stored pixels, so labelled images (:func:`read_image`,
+:func:`read_rgb`) and textures ignore the EXIF orientation. Photos without labels are turned upright
+(:func:`read_photo`, :func:`read_picture`).
 """
 
 from __future__ import annotations
@@ -71,11 +75,11 @@ _JPEG: Final = b"\xff\xd8"
 _JPEG_END: Final = b"\xff\xd9"
 
 
-def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
+def read_picture(path: Path, longest_px: int | None = None, *, upright: bool = True) -> RGBImage:
     """Read an image in one of :data:`FORMATS` as RGB.
 
     Images with a side above ``longest_px`` are downscaled; a JPEG is then decoded at a reduced
-    size, which is faster.
+    size, which is faster. ``upright`` applies the EXIF orientation.
 
     Raises:
         ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
@@ -86,10 +90,14 @@ def read_picture(path: Path, longest_px: int | None = None) -> RGBImage:
                 raise ValueError(f"{image.width}×{image.height} pixels")
             scale = 1.0 if longest_px is None else longest_px / max(image.size)
             if scale >= 1:
-                return np.asarray(image.convert("RGB"))
-            size = (max(round(image.width * scale), 1), max(round(image.height * scale), 1))
-            image.draft("RGB", size)
-            return np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX))
+                pixels = image.convert("RGB")
+            else:
+                size = (max(round(image.width * scale), 1), max(round(image.height * scale), 1))
+                image.draft("RGB", size)
+                pixels = image.convert("RGB").resize(size, Image.Resampling.BOX)
+            if upright:
+                ImageOps.exif_transpose(pixels, in_place=True)
+            return np.asarray(pixels)
     except Exception as error:  # PIL raises a different type for every way to be damaged
         raise ValueError(_reason(error)) from error
 

@@ -4,7 +4,8 @@ import pytest
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import read_image, read_photo, read_rgb
+from dopepp.drawing.pictures import read_image, read_photo, read_picture, read_rgb
+from dopepp.parts.mesh.obj import read_texture
 
 
 @pytest.fixture
@@ -87,6 +88,17 @@ def test_the_orientation_of_a_photo_agrees_with_opencv(tmp_path, image, orientat
     expected = cv2.imread(str(path))[..., ::-1]
     assert read_photo(path).shape == expected.shape
     np.testing.assert_allclose(read_photo(path).astype(int), expected.astype(int), atol=4)
+    np.testing.assert_array_equal(read_picture(path), read_photo(path))
+    height, width = expected.shape[:2]
+    assert read_picture(path, max(width, height) // 2).shape[:2] == (height // 2, width // 2)
+
+
+def test_labelled_images_and_textures_keep_their_stored_pixels(tmp_path, image):
+    path, exif = tmp_path / "image.png", Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(image).save(path, exif=exif)
+    for read in (read_rgb, read_image, read_texture):
+        np.testing.assert_array_equal(read(path), image)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])

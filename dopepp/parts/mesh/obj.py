@@ -198,7 +198,7 @@ def read_texture(path: Path) -> RGBImage:
         UserError: The image is damaged or larger than 8,192 pixels a side.
     """
     try:
-        return read_picture(path)
+        return read_picture(path, upright=False)
     except ValueError as error:
         allowed = f"a complete {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels"
         fix = "save the texture again in this form"
