@@ -231,9 +231,12 @@ class EmptyMaps(Callback):
             self._warn(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Warn if the last validation had empty maps and the warning was not logged before."""
+        """Warn if the last validation had empty maps and the warning was not logged before.
+
+        A resumed training that ends without a validation has no values to report.
+        """
         assert isinstance(pl_module, PoseSystem)
-        if self._num_empty:
+        if self._num_empty and self._inside:
             self._warn(trainer, pl_module)
 
     def _warn(self, trainer: Trainer, system: PoseSystem) -> None:

@@ -109,6 +109,8 @@ def test_a_short_training_warns_at_its_end_and_a_resumed_training_continues_the_
     assert STEPS in first_cause(caplog)
     validations.callback = EmptyMaps(patience=2)
     validations.callback.load_state_dict(state)
+    validations.end()  # without a validation
+    assert not caplog.messages
     validations(0.001, 1.0)
     assert "from 2 to 1" in caplog.messages[0]
 
