@@ -156,6 +156,8 @@ class _Presets(Mapping[str, Preset]):
     """The shipped presets by name; a preset's file is read on access."""
 
     def __getitem__(self, name: str) -> Preset:
+        if name not in _NAMES:
+            raise KeyError(name)
         return preset_of(name)
 
     def __contains__(self, name: object) -> bool:

@@ -112,6 +112,15 @@ def test_resized_draws_the_same_poses(box_part):
     np.testing.assert_allclose(large, small, atol=1e-9)
 
 
+def test_the_shipped_presets_are_a_mapping(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("base: paper\n")
+    for name in ("unknown", str(path)):  # preset_of reads a file
+        assert name not in PRESETS
+        assert PRESETS.get(name) is None
+    assert preset_of(str(path)).name == "mine"
+
+
 @pytest.mark.parametrize("name", sorted(PRESETS))
 @pytest.mark.parametrize("size", [(416, 416), (1280, 720), (720, 1280), (320, 240), (100, 333)])
 def test_reframing_keeps_square_pixels_and_the_view_along_the_shorter_side(name, size):
