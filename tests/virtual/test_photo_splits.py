@@ -71,6 +71,16 @@ def test_a_new_photo_moves_few_photos_to_another_split(tmp_path):
     assert moved <= 2  # at the two borders of the order of hashes
 
 
+def test_the_photos_of_a_folder_are_read_once(tmp_path):
+    photos = write_numbers(tmp_path, range(20))
+    names = [path.name for path in photos.paths]
+    train = photos.part("train")
+    for path in photos.paths:
+        path.unlink()
+    val, test = (PhotoBackgrounds(tmp_path, names).part(split) for split in ("val", "test"))
+    assert sorted([*train.paths, *val.paths, *test.paths]) == photos.paths
+
+
 def test_the_identity_names_the_split(tmp_path):
     photos = write_numbers(tmp_path, range(20))
     identities = {tuple(photos.part(split).identity()) for split in (*SPLITS, "all")}

@@ -8,6 +8,7 @@ import logging
 import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -89,12 +90,8 @@ class PhotoBackgrounds:
         """
         if split == "all":
             return self
-        by_hash: dict[bytes, list[str]] = {}
-        for path in self.paths:
-            with path.open("rb") as file:
-                key = hashlib.sha256(file.read(_HASHED_BYTES)).digest()
-            by_hash.setdefault(key, []).append(path.relative_to(self.folder).as_posix())
-        groups = [by_hash[key] for key in sorted(by_hash)]
+        names = tuple(path.relative_to(self.folder).as_posix() for path in self.paths)
+        groups = _equal_photos(self.folder, names)
         part = copy.copy(self)
         if len(groups) >= 3 * MIN_PHOTOS:
             count = max(MIN_PHOTOS, round(held_out * len(groups)))
@@ -194,6 +191,20 @@ class PhotoBackgrounds:
         text = "skipping the damaged background photo %s: %s (%d of at most %d)"
         logger.warning(text, path, self.bad[path], len(self.bad), most)
         return None
+
+
+@cache
+def _equal_photos(folder: Path, names: tuple[str, ...]) -> list[list[str]]:
+    """Return groups of photos that begin with the same bytes, in the order of these bytes' hashes.
+
+    The files are read once per process, because a run divides a folder several times.
+    """
+    by_hash: dict[bytes, list[str]] = {}
+    for name in names:
+        with (folder / name).open("rb") as file:
+            key = hashlib.sha256(file.read(_HASHED_BYTES)).digest()
+        by_hash.setdefault(key, []).append(name)
+    return [by_hash[key] for key in sorted(by_hash)]
 
 
 def _halvings(photo: RGBImage) -> list[RGBImage]:
