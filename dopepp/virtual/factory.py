@@ -38,7 +38,8 @@ from dopepp.virtual.tabletop import arrange_on_table
 BESIDE_DEG: Final = (20.0, 40.0)  # angle between the preset's and a further camera of a scene
 
 _PACKAGE: Final = Path(__file__).parents[1]
-_FOLDERS: Final = ("virtual", "parts", "geometry")  # the code that decides pixels and labels
+# The code that decides pixels and labels, including the decoding of background photos.
+_CODE: Final = ("virtual/**/*.py", "parts/**/*.py", "geometry/**/*.py", "drawing/pictures.py")
 
 
 class Factory:
@@ -214,8 +215,8 @@ def _shift(T_cam: Transform, shift: Vector) -> Transform:
 def code_hash() -> str:
     """Return a SHA-256 of the rendering code; a cache of renders from other code is not reused."""
     digest = hashlib.sha256()
-    for folder in _FOLDERS:
-        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+    for pattern in _CODE:
+        for path in sorted(_PACKAGE.glob(pattern)):
             digest.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 

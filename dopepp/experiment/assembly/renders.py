@@ -19,6 +19,7 @@ from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets import Preset
+from dopepp.virtual.renderers import renderer_identity
 
 
 def training_renders(
@@ -94,10 +95,11 @@ def with_cache(
     folder = None
     if cache == "disk":
         folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
-    most = MAX_LABELLED
+    identity, most = code_hash(), MAX_LABELLED
     if isinstance(source, RenderedSource):
+        identity += renderer_identity(source.factory.renderer)
         most = source.factory.preset.targets_per_image[1]
-    return CachedSource(source, input_size, folder, identity=code_hash(), max_instances=most)
+    return CachedSource(source, input_size, folder, identity, max_instances=most)
 
 
 def training_preset(data: DataConfig) -> Preset:

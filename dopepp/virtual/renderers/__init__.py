@@ -1,13 +1,16 @@
 """Renderers by name, imported on demand.
 
 To add a renderer, write a module with ``render(scene) -> Rendered`` and add it to
-:data:`RENDERERS`, or add an entry point ``dopepp.renderers`` (:mod:`dopepp.core.extensions`).
+:data:`RENDERERS`, or add an entry point ``dopepp.renderers`` (:mod:`dopepp.core.extensions`). If
+more than the code of ``dopepp`` determines the images, e.g. the version of another library, add
+``identity() -> str``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+from types import ModuleType
 from typing import Final
 
 from dopepp.core import extensions
@@ -30,11 +33,27 @@ def find_renderer(name: str) -> Renderer:
     Raises:
         UserError: The renderer is unknown, or a package that it needs is not installed.
     """
+    render: Renderer = _module(name).render
+    return render
+
+
+def renderer_identity(name: str) -> str:
+    """Return the identity that a renderer publishes, or an empty string.
+
+    Images that were rendered with another identity or another ``code_hash`` are not reused.
+
+    Raises:
+        UserError: As for :func:`find_renderer`, or the renderer cannot run in this process.
+    """
+    identity: Callable[[], str] = getattr(_module(name), "identity", str)
+    return identity()
+
+
+def _module(name: str) -> ModuleType:
     modules = (
         RENDERERS if name in RENDERERS else {**extensions.components("renderers"), **RENDERERS}
     )
     if name not in modules:
         fix = f"choose one of these names, or {extensions.advice('renderers', name)}"
         raise UserError(f"renderer {name!r}", ", ".join(modules), fix)
-    render: Renderer = import_module(modules[name]).render
-    return render
+    return import_module(modules[name])

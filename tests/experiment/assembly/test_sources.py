@@ -1,5 +1,6 @@
 import logging
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,8 +25,9 @@ from dopepp.experiment.run.evaluate import parts_of
 from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.metrics.row import shown_columns
 from dopepp.parts.catalogue import servoholder
-from dopepp.virtual.factory import Factory
+from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets import preset_of
+from dopepp.virtual.renderers import raster
 
 
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
@@ -54,6 +56,31 @@ def test_a_cache_holds_all_targets_that_a_preset_allows(tiny, tmp_path, monkeypa
     monkeypatch.setattr(source, "sample", lambda index, epoch=0: crowd)
     data = tiny(f"data.cache_dir={tmp_path}").data
     assert len(with_cache(source, data, "disk", (64, 64)).sample(1).instances) == 60
+
+
+def test_a_cache_on_disk_belongs_to_code_and_version_of_its_renderer(tiny, tmp_path, monkeypatch):
+    data = tiny(f"data.cache_dir={tmp_path}").data
+    source = RenderedSource(Factory([servoholder()], preset_of("quickstart"), 0), 2)
+
+    def folder():
+        return with_cache(source, data, "disk", (64, 64)).folder
+
+    first = folder()
+    assert folder() == first
+    monkeypatch.setattr(raster, "identity", lambda: "version 2", raising=False)
+    assert folder() != first
+    monkeypatch.undo()
+    read_bytes = Path.read_bytes
+
+    def changed(path):
+        return read_bytes(path) + b"\n" * (path.name == "pictures.py")
+
+    monkeypatch.setattr(Path, "read_bytes", changed)
+    code_hash.cache_clear()
+    assert folder() != first
+    monkeypatch.undo()
+    code_hash.cache_clear()
+    assert folder() == first
 
 
 def test_held_out_images_are_equal_for_all_seeds_and_differ_between_splits(tiny):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import zlib
 from functools import cache
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from runpy import run_path
@@ -96,6 +97,16 @@ def render(scene: Scene) -> Rendered:
                 traced = film.resampled(tracer.trace(tracer.world, film))
                 image[area] = _composite(traced[..., :3], traced[..., 3], image[area])
     return Rendered(image, depth, instances, fractions, scene)
+
+
+def identity() -> str:
+    """Return the versions of Mitsuba, with its variant, and of Open Image Denoise's package.
+
+    Raises:
+        UserError: Mitsuba cannot run in this process (see the docstring of this package).
+    """
+    mi = mitsuba()
+    return f"mitsuba {mi.__version__} {mi.variant()} pyoidn {version('pyoidn')}"
 
 
 def _objects_window(scene: Scene) -> Box | None:

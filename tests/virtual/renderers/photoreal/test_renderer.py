@@ -15,7 +15,7 @@ from dopepp.geometry.camera import make_transform
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.virtual import PRESETS, Factory, make_surface, render
-from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.renderers import find_renderer, renderer_identity
 from dopepp.virtual.scene import Grooves, Light, Material, Panel, Plane, SceneObject
 from tests.parts.makers import mesh_of
 from tests.virtual.conftest import even_light
@@ -28,6 +28,13 @@ def photoreal():
     pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
     pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
     return find_renderer("photoreal")
+
+
+def test_the_identity_names_the_library_and_its_variant(photoreal):
+    mitsuba = importlib.import_module("mitsuba")
+    words = renderer_identity("photoreal").split()
+    assert words[:3] == ["mitsuba", mitsuba.__version__, mitsuba.variant()]
+    assert renderer_identity("raster") == ""  # the hash of dopepp's code is enough
 
 
 def lying(part, height, **options):
