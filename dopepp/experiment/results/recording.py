@@ -59,7 +59,7 @@ def measure_and_record(
     protocols: Protocols | None = None,
     refine: Refine | None = None,
     without_parts: SampleSource | None = None,
-) -> list[Report]:
+) -> tuple[Report, list[Report]]:
     """Measure methods on a test set; print and write tables, curves and images.
 
     ``metrics.json`` describes the last estimator, with its refined poses under ``refined``, or the
@@ -70,29 +70,20 @@ def measure_and_record(
     without the parts, are counted.
 
     Returns:
-        A report per estimator, then per file.
+        The report in ``metrics.json``, and the reports of the estimators, the files, and the
+        estimators on several views.
     """
     protocols = protocols or Protocols()
     source: SampleSource = held_out_source(data, parts, "test")
     numbers = object_numbers(data, parts)
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
-    methods: dict[str, Method] = {}
-    for name, estimator in estimators.items():
-        methods[name] = EstimatorMethod(estimator, parts)
-        if refine is not None and isinstance(estimator, NetworkEstimator):
-            refined = " + ".join([name, *refine_terms(refine)])
-            methods[refined] = EstimatorMethod(refining(estimator, refine, parts), parts)
-    methods |= files
+    detectors = _estimator_methods(estimators, refine, parts)
+    views = _views_methods(detectors, data.views, parts)
+    methods: dict[str, Method] = {**detectors, **files}
     # Impossible protocols are rejected before anything is measured.
     if protocols.shading:
         conditions.check_masks(source)
     scaled = {scale: scaled_test_renders(data, parts, scale) for scale in protocols.scales}
-    detectors = {n: m.estimator for n, m in methods.items() if isinstance(m, EstimatorMethod)}
-    views = {  # poses of several views need a refinement that verifies them
-        f"{name}, {data.views} views": ViewsMethod(estimator, parts)
-        for name, estimator in detectors.items()
-        if data.views > 1 and estimator.refiner is not None and estimator.refiner.verifies
-    }
     if views:
         source = with_views(source, data.views)
     samples = (source.sample(index, 0) for index in range(len(source)))
@@ -106,21 +97,11 @@ def measure_and_record(
         if report.name in measured.bop:
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
     _show_rejections(both, measured.silent, source)
-    # Later comparisons use the unrefined result of the network, or the file if there is none.
-    reports = of_networks(measured.reports, len(files) + len(views))
-    refines = refine is not None and bool(estimators)
-    main = reports[-2 if refines else -1]
-    main.details.update(details or {})
     _record_coverage(run_dir, measured)
     if without_parts is not None:
-        _record_false_alarms(run_dir, detectors, reports, without_parts)
-    if refines:
-        main.refined = reports[-1]
-        shares = main.details["made_worse"] = made_worse(
-            measured.metrics[main.name], measured.metrics[main.refined.name]
-        )
-        in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
-        display.console.print(f"poses that refinement made worse by over 1 mm: {in_words}")
+        _record_false_alarms(run_dir, detectors, measured.reports, without_parts)
+    main = _main_report(measured, list(detectors or files), refine is not None and bool(detectors))
+    main.details.update(details or {})
     write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -139,17 +120,51 @@ def measure_and_record(
         levels = conditions.measure_scales(methods, scaled, measured, num_pictures)
         conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
     display.show_files(run_dir)
-    return measured.reports
+    return main, measured.reports
 
 
-def of_networks(reports: list[Report], num_files: int) -> list[Report]:
-    """Return the reports without the last ``num_files``, or all reports if none remains."""
-    return reports[: len(reports) - num_files] or reports
+def _estimator_methods(
+    estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
+) -> dict[str, EstimatorMethod]:
+    """Return a method per estimator and, with ``refine``, another with refined poses after it."""
+    methods = {}
+    for name, estimator in estimators.items():
+        methods[name] = EstimatorMethod(estimator, parts)
+        if refine is not None and isinstance(estimator, NetworkEstimator):
+            refined = " + ".join([name, *refine_terms(refine)])
+            methods[refined] = EstimatorMethod(refining(estimator, refine, parts), parts)
+    return methods
 
 
-def main_report(reports: Sequence[Report]) -> Report:
-    """Return the first report with refined poses, or else the last report."""
-    return next((report for report in reports if report.refined is not None), reports[-1])
+def _views_methods(
+    methods: Mapping[str, EstimatorMethod], num_views: int, parts: Parts
+) -> dict[str, ViewsMethod]:
+    """Return a method on several views per estimator with a refinement that verifies poses."""
+    return {
+        f"{name}, {num_views} views": ViewsMethod(method.estimator, parts)
+        for name, method in methods.items()
+        if num_views > 1
+        and method.estimator.refiner is not None
+        and method.estimator.refiner.verifies
+    }
+
+
+def _main_report(measured: Measured, names: Sequence[str], refines: bool) -> Report:
+    """Return the report of the last of the methods ``names``, a result on single images.
+
+    Later comparisons use the unrefined result of a network. If the last method ``refines`` the
+    poses of the method before, its report is attached to the returned report.
+    """
+    reports = {report.name: report for report in measured.reports}
+    if not refines:
+        return reports[names[-1]]
+    main, refined = (reports[name] for name in names[-2:])
+    main.refined = refined
+    shares = made_worse(measured.metrics[main.name], measured.metrics[refined.name])
+    main.details["made_worse"] = shares
+    in_words = ", ".join(f"{share:.1%} in {error}" for error, share in shares.items())
+    display.console.print(f"poses that refinement made worse by over 1 mm: {in_words}")
+    return main
 
 
 def refining(estimator: NetworkEstimator, refine: Refine | None, parts: Parts) -> NetworkEstimator:
@@ -197,14 +212,16 @@ def _record_coverage(run_dir: Path, measured: Measured) -> None:
 
 def _record_false_alarms(
     run_dir: Path,
-    estimators: Mapping[str, PoseEstimator],
+    methods: Mapping[str, EstimatorMethod],
     reports: Sequence[Report],
     frames: SampleSource,
 ) -> None:
-    """Measure estimators on images without their parts, and add the counts to the reports."""
+    """Measure estimators on images without their parts, and add the counts to their reports."""
+    estimators = {name: method.estimator for name, method in methods.items()}
     alarms, tiles = count_false_alarms(estimators, frames)
     for report in reports:
-        report.details[KEY] = asdict(alarms[report.name])
+        if report.name in alarms:
+            report.details[KEY] = asdict(alarms[report.name])
     display.show_table(TITLE, [alarm.row(name) for name, alarm in alarms.items()])
     if tiles:
         write_png(run_dir / "without_part.png", contact_sheet(tiles, columns=3))

@@ -21,12 +21,7 @@ from dopepp.experiment.results import display
 from dopepp.experiment.results.false_alarms import frames_without_parts
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
 from dopepp.experiment.results.pages import write_run_readme
-from dopepp.experiment.results.recording import (
-    main_report,
-    measure_and_record,
-    of_networks,
-    refining,
-)
+from dopepp.experiment.results.recording import measure_and_record, refining
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
@@ -154,7 +149,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if options.negatives is not None:
         camera = None if options.negatives_camera is None else Path(options.negatives_camera)
         without_parts = frames_without_parts(Path(options.negatives), camera, data, parts)
-    reports = measure_and_record(
+    main, reports = measure_and_record(
         estimators,
         parts,
         data,
@@ -167,8 +162,7 @@ def run_evaluation(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         refine=options.refine,
         without_parts=without_parts,
     )
-    described = main_report(of_networks(reports, len(files)))
-    write_run_readme(run_dir, f"Evaluation of {measured}", described)
+    write_run_readme(run_dir, f"Evaluation of {measured}", main)
     return reports
 
 

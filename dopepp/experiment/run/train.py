@@ -287,7 +287,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
     score = savers[0].best_model_score if savers else None
     if score is not None and score.isfinite():
         details[OBJECTIVE] = float(score)
-    return measure_and_record(
+    report, _ = measure_and_record(
         {config.model.name: estimator},
         parts,
         config.data,
@@ -296,7 +296,8 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
         details=details,
         protocols=config.protocols,
         refine=config.refine,
-    )[0]
+    )
+    return report
 
 
 JOBS: Final[Mapping[str, Callable[[RunConfig, Path], object]]] = {

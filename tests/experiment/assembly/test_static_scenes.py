@@ -12,6 +12,7 @@ from dopepp.data.formats.bop.bop_reader import BopReader
 from dopepp.data.render_job import make_job
 from dopepp.data.render_run import render_dataset
 from dopepp.experiment.assembly.static_scenes import StaticScenes, with_views
+from dopepp.experiment.results.measurement import EstimatorMethod, ViewsMethod
 from dopepp.experiment.run.evaluate import run_evaluation
 from dopepp.geometry.camera import invert_transform
 from dopepp.parts.catalogue import pivconnector
@@ -115,6 +116,23 @@ def test_several_views_are_measured_in_addition(root, composed, tmp_path):
     config = composed(*options, "data.views=2", config="evaluate")
     with pytest.raises(UserError, match=r"data\.views=2 without refine=region"):
         run_evaluation(config, tmp_path / "other")
+
+
+def test_readme_and_metrics_describe_the_result_on_single_images(
+    root, composed, monkeypatch, tmp_path
+):
+    for method in (EstimatorMethod, ViewsMethod):
+        monkeypatch.setattr(method, "detect", lambda *_: ([], 0.01))
+    options = (
+        "templates=[0.3,0.6]", "data=bop", f"data.root={root}", "data.views=2", "num_pictures=0",
+        "data.image_sets={train: null, val: null, test: train_pbr}",
+    )  # fmt: skip
+    single, views = run_evaluation(composed(*options, config="evaluate"), tmp_path)
+    assert (single.name, views.name) == ("templates", "templates, 2 views")
+    assert json.loads((tmp_path / "metrics.json").read_text())["name"] == "templates"
+    readme = (tmp_path / "README.md").read_text()
+    assert "templates" in readme
+    assert "2 views" not in readme
 
 
 def test_renders_on_demand_have_no_views():
