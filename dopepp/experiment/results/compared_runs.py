@@ -18,15 +18,15 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment.config.data_config import AUTOMATIC
-from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
     CONFIG_FILE,
+    COST_FILE,
     FAILURE_FILE,
     LAST_CHECKPOINT,
     METRICS_FILE,
     PRUNED_FILE,
-    read_json,
+    read_end,
 )
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.report import Cost, Report
@@ -187,14 +187,12 @@ def _without(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
 
 def _read_result(run: Run) -> None:
     """Set the result and cost of a run (only the cost for ``job=cost``), or the failure."""
-    names = (FAILURE_FILE, PRUNED_FILE, METRICS_FILE, COST_FILE)
-    name = next((name for name in names if (run.folder / name).is_file()), None)
-    if name is None:
+    name, record = read_end(run.folder)
+    if not name:
         run.failure = f"unfinished: no {METRICS_FILE}"
         if (run.folder / LAST_CHECKPOINT).is_file():
             run.failure += f"; continue with resume={run.folder}"
         return
-    record = read_json(run.folder / name)
     try:
         if name == METRICS_FILE:
             run.report = Report.from_record(record)

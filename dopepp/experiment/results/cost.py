@@ -32,7 +32,13 @@ from dopepp.experiment.assembly.build_sources import fit_to_camera, held_out_sou
 from dopepp.experiment.assembly.build_system import build_untrained
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
-from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
+from dopepp.experiment.results.folder import (
+    COST_FILE,
+    VERSIONS_FILE,
+    environment,
+    write_config,
+    write_json,
+)
 from dopepp.experiment.results.pages import write_run_readme
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.network_estimator import Maps, NetworkEstimator
@@ -41,7 +47,6 @@ from dopepp.maps.codec import MapGeometry
 from dopepp.models.network import network_cost
 from dopepp.training.targets import draw_maps
 
-COST_FILE: Final = "cost.json"
 FRAMES_FILE: Final = "frames.csv"
 
 NOTE: Final = (

@@ -30,6 +30,7 @@ VERSIONS_FILE: Final = "versions.json"
 METRICS_FILE: Final = "metrics.json"
 FAILURE_FILE: Final = "failed.json"
 PRUNED_FILE: Final = "pruned.json"
+COST_FILE: Final = "cost.json"
 OBJECTIVE: Final = "objective"
 """Key of ``metrics.json``: validation value by which the best checkpoint was selected."""
 OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
@@ -62,6 +63,14 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise UserError(f"{path}, which contains a {type(record).__name__}", allowed, fix)
     return record
+
+
+def read_end(run: Path) -> tuple[str, dict[str, Any]]:
+    """Return the name and the content of the file that a run wrote at its end; empty without it."""
+    for name in (FAILURE_FILE, PRUNED_FILE, METRICS_FILE, COST_FILE):
+        if (run / name).is_file():
+            return name, read_json(run / name)
+    return "", {}
 
 
 def write_environment(

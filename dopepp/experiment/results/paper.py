@@ -26,9 +26,9 @@ from dopepp.experiment.config.run_config import AUTO
 from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SHADING
-from dopepp.experiment.results.cost import COST_FILE, FRAMES_FILE, NOTE, save_frame_rates
+from dopepp.experiment.results.cost import FRAMES_FILE, NOTE, save_frame_rates
 from dopepp.experiment.results.differences import REFINED_NOTE, comparison_values, noise_notes
-from dopepp.experiment.results.folder import read_json
+from dopepp.experiment.results.folder import COST_FILE, read_json
 from dopepp.experiment.results.frame import (
     ADD_5CM,
     ADD_10CM,

@@ -107,15 +107,13 @@ def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
 
 def _state(job: Path) -> str:
     """Return the state of a job from the files in its folder, with the reason for a failure."""
-    from dopepp.experiment.results.cost import COST_FILE
-    from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, PRUNED_FILE, read_json
+    from dopepp.experiment.results.folder import FAILURE_FILE, PRUNED_FILE, read_end
 
-    ends = {FAILURE_FILE: "failed", PRUNED_FILE: "stopped by the search"}
-    for name, word in ends.items():
-        if (job / name).is_file():
-            return f"{word}: {read_json(job / name).get('reason', '')}"
-    done = any((job / name).is_file() for name in (METRICS_FILE, COST_FILE))
-    return "finished" if done else "unfinished"
+    name, record = read_end(job)
+    early = {FAILURE_FILE: "failed", PRUNED_FILE: "stopped by the search"}
+    if name in early:
+        return f"{early[name]}: {record.get('reason', '')}"
+    return "finished" if name else "unfinished"
 
 
 def is_remote(hydra: Any) -> bool:

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import optuna
 from hydra.core.config_loader import ConfigLoader
@@ -30,31 +30,34 @@ from hydra.errors import HydraException
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf
 from optuna import distributions
-from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import Range, check
+from dopepp.core.validation import Range, parse
 from dopepp.experiment.config.run_config import flatten, is_below
 from dopepp.experiment.results import display
-from dopepp.experiment.results.folder import (
-    FAILURE_FILE,
-    METRICS_FILE,
-    OBJECTIVE,
-    PRUNED_FILE,
-    read_json,
-)
+from dopepp.experiment.results.folder import OBJECTIVE, PRUNED_FILE, read_end
 from dopepp.training.pruning import MOST, open_storage
 
 _FACTS: Final = "configuration"
 _NUM_SHOWN: Final = 3
-_MAX_PARALLEL: Final = 10_000
-_DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
 _NO_PART: Final = (
     "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
     "search.space", "callbacks.trial.storage",
 )  # fmt: skip
 """Options that may differ between commands of a study; the space is compared as text."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Options of the node ``search`` that this process reads; the jobs read the others."""
+
+    study: str | int  # name of the study
+    storage: str  # SQLite file or database URL
+    mode: Literal["max", "min"]
+    num_trials: Annotated[int, Range(1, MOST)]
+    num_parallel: Annotated[int, Range(1, 10_000)]
+    space: tuple[str, ...]  # Hydra sweeps
 
 
 @dataclass(frozen=True)
@@ -80,10 +83,8 @@ def search(
             "an experiment without a sweep, such as experiment=quickstart",
             "leave out search=optuna, or choose another experiment",
         )
-    options: Any = OmegaConf.to_container(config.search, resolve=True)
-    wanted = check("search.num_trials", options["num_trials"], int, Range(1, MOST))
-    at_a_time = check("search.num_parallel", options["num_parallel"], int, Range(1, _MAX_PARALLEL))
-    space = read_space(loader, options["space"], arguments)
+    options = parse(Search, OmegaConf.to_container(config.search, resolve=True), "search")
+    space = read_space(loader, options.space, arguments)
     for example in examples(space):
         loader.load_sweep_config(config, example)
     folder = Path(str(config.hydra.sweep.dir))
@@ -91,11 +92,11 @@ def search(
     # All options that affect the result of a trial, and the search space.
     facts = {key: str(value) for key, value in flatten(plain) if not is_below(key, _NO_PART)}
     facts |= {f"search.space {key}": text for key, text in space.texts.items()}
-    with exclusive_search(folder, str(options["study"])):
+    with exclusive_search(folder, options.study):
         study = open_study(options, facts, int(config.seed))
         trials = _Trials(study, space, launcher, folder)
         OmegaConf.save(config, folder / "multirun.yaml")
-        returns = trials.run(wanted, at_a_time)
+        returns = trials.run(options.num_trials, options.num_parallel)
         _report(study, options)
     return returns
 
@@ -162,15 +163,17 @@ def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequen
             yield left[first : first + at_most]
 
 
-def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
+def _report(study: optuna.Study, options: Search) -> None:
     """Print the number of trials by state, and the overrides of the best complete trial."""
     states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
     counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
-    display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
+    display.console.print(f"study {study.study_name}: {counts}; {options.storage}")
     if states[TrialState.COMPLETE.name.lower()]:
         best = study.best_trial
-        options_of = " ".join(search_overrides(best.params))
-        display.console.print(f"best trial {best.number}, objective {best.value:.4f}: {options_of}")
+        best_options = " ".join(search_overrides(best.params))
+        display.console.print(
+            f"best trial {best.number}, objective {best.value:.4f}: {best_options}"
+        )
 
 
 def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
@@ -259,7 +262,7 @@ def search_overrides(params: dict[str, object]) -> list[str]:
 
 
 @contextmanager
-def exclusive_search(folder: Path, study: str) -> Iterator[None]:
+def exclusive_search(folder: Path, study: str | int) -> Iterator[None]:
     """Lock a folder against a second search, until the context or the process ends."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".search.lock").open("w") as stream:
@@ -275,21 +278,18 @@ def exclusive_search(folder: Path, study: str) -> Iterator[None]:
         yield
 
 
-def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
-    """Open or create the Optuna study of the node ``search``.
+def open_study(options: Search, facts: Mapping[str, str], seed: int) -> optuna.Study:
+    """Open or create the Optuna study of a search.
 
     ``facts`` are the fixed options that affect the result of a trial, and the search space. The
     number of stored trials is added to the sampler's ``seed``.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    name = str(options["study"])
-    if options["mode"] not in _DIRECTIONS:
-        fix = "set search.mode=max or search.mode=min"
-        raise UserError(f"search.mode={options['mode']}", "max or min", fix)
+    name = str(options.study)
     study = optuna.create_study(
-        storage=open_storage(str(options["storage"])),
+        storage=open_storage(options.storage),
         study_name=name,
-        direction=_DIRECTIONS[str(options["mode"])],
+        direction=f"{options.mode}imize",
         load_if_exists=True,
     )
     begun_with = study.user_attrs.get(_FACTS)
@@ -320,13 +320,8 @@ def _check_same(stored: Mapping[str, str], now: Mapping[str, str], study: str) -
 
 def outcome(folder: Path) -> tuple[TrialState, float | None]:
     """Return state and objective of a trial from its files; a non-finite objective is a failure."""
-    if (folder / PRUNED_FILE).is_file():
-        return TrialState.PRUNED, None
-    if (folder / FAILURE_FILE).is_file():
-        return TrialState.FAIL, None
-    if not (folder / METRICS_FILE).is_file():
-        return TrialState.RUNNING, None
-    value = read_json(folder / METRICS_FILE).get(OBJECTIVE)
-    if not isinstance(value, (int, float)) or not math.isfinite(value):
-        return TrialState.FAIL, None
-    return TrialState.COMPLETE, float(value)
+    name, record = read_end(folder)
+    value = record.get(OBJECTIVE)  # of a complete trial
+    if isinstance(value, (int, float)) and math.isfinite(value):
+        return TrialState.COMPLETE, float(value)
+    return {"": TrialState.RUNNING, PRUNED_FILE: TrialState.PRUNED}.get(name, TrialState.FAIL), None

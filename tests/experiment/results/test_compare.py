@@ -22,14 +22,19 @@ from dopepp.experiment.results.compare import (
     read_log_column,
 )
 from dopepp.experiment.results.compared_runs import Entry, find_runs, group, read_run, with_refined
-from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.differences import (
     compact_table,
     comparison_values,
     differences,
     full_table,
 )
-from dopepp.experiment.results.folder import CONFIG_FILE, METRICS_FILE, write_config, write_json
+from dopepp.experiment.results.folder import (
+    CONFIG_FILE,
+    COST_FILE,
+    METRICS_FILE,
+    write_config,
+    write_json,
+)
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN
 from tests.experiment.conftest import report_of, write_run

@@ -25,8 +25,8 @@ from dopepp.experiment.results.breakdown import record_breakdown
 from dopepp.experiment.results.compare import compare_paths, write_comparison
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SCALE, SHADING, Level, record_condition
-from dopepp.experiment.results.cost import COST_FILE, NetworkCost
-from dopepp.experiment.results.folder import VERSIONS_FILE, write_json
+from dopepp.experiment.results.cost import NetworkCost
+from dopepp.experiment.results.folder import COST_FILE, VERSIONS_FILE, write_json
 from dopepp.experiment.results.frame import ADD_01D, ADD_5CM
 from dopepp.experiment.results.pages import release
 from dopepp.experiment.sweep.multirun import CompareJobs
