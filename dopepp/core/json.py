@@ -6,17 +6,25 @@ these raise :class:`~dopepp.core.errors.UserError`.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import math
 import re
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import read_limited
+from dopepp.core.files import cache_folder, read_limited, write_file
+from dopepp.core.validation import parse
+
+T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
 
 MAX_BYTES: Final = 64_000_000
 """Default size limit: 10,000 images of a BOP scene with ten objects each. Parsed JSON takes up to
@@ -80,6 +88,24 @@ def parse_json(text: str | bytes, where: str) -> object:
         raise _bad(where, problem) from error
     except ValueError as error:  # of a hook; or an integer of thousands of digits
         raise _bad(where, str(error)) from error
+
+
+def cached(folder: str, key: tuple[object, ...], kind: type[T], make: Callable[[], T]) -> T:
+    """Return a JSON value from a folder of the user's cache, under a hash of ``key``.
+
+    A missing or damaged file is written again. If that fails, a warning is logged.
+    """
+    name = f"{hashlib.sha256(repr(key).encode()).hexdigest()[:32]}.json"
+    path = cache_folder() / folder / name
+    try:
+        return parse(kind, read_json(path))
+    except (OSError, UserError):
+        value = make()
+    try:
+        write_file(path, json.dumps(value).encode())
+    except OSError as error:
+        logger.warning("%s: cannot store the value in the cache: %s", path, error)
+    return value
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

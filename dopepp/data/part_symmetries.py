@@ -18,7 +18,7 @@ from dopepp.core.json import read_json
 from dopepp.data.formats.bop import bop_models
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
-from dopepp.parts.symmetry_finder import LARGEST_TOLERANCE, TOLERANCE, find_symmetries
+from dopepp.parts.symmetry_finder import LARGEST_TOLERANCE, TOLERANCE, cached_symmetries
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ def with_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
         problem = f"part {part.name} without a mesh, which the search for symmetries needs"
         fix = "write its symmetries into a file, or set data.symmetries=none"
         raise UserError(problem, "parts with a mesh", fix)
-    discrete, continuous = find_symmetries(part.mesh, tolerance)
+    discrete, continuous = cached_symmetries(part.mesh, tolerance)
     found = f"{len(discrete)} discrete symmetries and {len(continuous)} axes of continuous symmetry"
     _log.info("%s: %s within %.3g mm", part.name, found, 1000 * tolerance * part.diameter)
     is_coloured = part.mesh.texture is not None or part.mesh.colours is not None

@@ -38,7 +38,7 @@ from dopepp.inference.templates.background_level import background_log_odds
 from dopepp.inference.templates.ranking import learned_ranking
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part, check_name
-from dopepp.parts.symmetry_finder import find_symmetries
+from dopepp.parts.symmetry_finder import cached_symmetries
 from dopepp.recovery.detection import (
     Detection,
     RecoveryOptions,
@@ -347,5 +347,5 @@ def load_solid_part(
     part = part if name is None else replace(part, name=check_name(name))
     if symmetries is None or part.mesh is None:
         return part
-    discrete, continuous = find_symmetries(part.mesh)
+    discrete, continuous = cached_symmetries(part.mesh)
     return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)

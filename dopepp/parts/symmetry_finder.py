@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
+from dopepp.core.json import cached
 from dopepp.geometry.rotation import (
     RotationMatrix,
     Vector,
@@ -21,7 +22,7 @@ from dopepp.geometry.rotation import (
     rotation_vector_to_matrix,
 )
 from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group, rotations_about
-from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
+from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, hash_triangles, largest_distance
 from dopepp.parts.part import Mesh
 
 _MAX_MEAN: Final = 0.06  # mean distance that excludes a symmetry within 2.6° of the axis, diameters
@@ -35,8 +36,22 @@ SMALLEST_TOLERANCE: Final = 1e-4
 
 MAX_ORDER: Final = 12  # Highest order of a discrete axis
 _NUM_PROBES: Final = 8000
+VERSION: Final = 1  # part of the cache's key; increase it when the search changes
 
 Symmetries = tuple[Float[np.ndarray, "symmetries 4 4"], tuple[ContinuousSymmetry, ...]]
+_Record = tuple[list[list[list[float]]], tuple[ContinuousSymmetry, ...]]
+
+
+def cached_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
+    """Return the result of :func:`find_symmetries`, which the user's cache folder stores."""
+
+    def make() -> _Record:
+        discrete, continuous = find_symmetries(mesh, tolerance)
+        return discrete.tolist(), continuous
+
+    key = VERSION, tolerance, hash_triangles(mesh.vertices, mesh.faces)
+    discrete, continuous = cached("symmetries", key, _Record, make)
+    return np.array(discrete, np.float64).reshape(-1, 4, 4), continuous
 
 
 def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:

@@ -8,7 +8,7 @@ from trimesh.creation import box, cone, cylinder, icosphere
 from trimesh.transformations import translation_matrix
 
 from dopepp.core.errors import UserError
-from dopepp.parts.symmetry_finder import find_symmetries
+from dopepp.parts.symmetry_finder import cached_symmetries, find_symmetries
 from tests.parts.makers import mesh_of
 
 
@@ -105,6 +105,21 @@ def test_a_larger_tolerance_overlooks_a_smaller_hole():
     mesh = as_mesh(plate((30, 10, 4)))
     assert len(find_symmetries(mesh, 0.01)[0]) == 0
     assert len(find_symmetries(mesh, 0.05)[0]) == 3
+
+
+def test_a_search_is_stored_by_mesh_and_tolerance(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    meshes = [as_mesh(shape) for shape in (box((3, 2, 1)), cylinder(33, 100), plate((30, 10, 4)))]
+    expected = [find_symmetries(mesh) for mesh in meshes]
+    searched = [cached_symmetries(mesh) for mesh in meshes]
+    with monkeypatch.context() as patch:
+        patch.setattr("dopepp.parts.symmetry_finder.find_symmetries", None)
+        stored = [cached_symmetries(mesh) for mesh in meshes]
+    assert len(cached_symmetries(meshes[2], 0.05)[0]) == 3
+    for (wanted, axes), *results in zip(expected, searched, stored, strict=True):
+        for discrete, continuous in results:
+            np.testing.assert_array_equal(discrete, wanted)
+            assert continuous == axes
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, 0.5, float("nan")])

@@ -8,8 +8,6 @@ standard deviations. The user's cache folder stores the level.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from importlib.resources import files
@@ -19,9 +17,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from dopepp.core.errors import UserError
-from dopepp.core.files import cache_folder, write_file
-from dopepp.core.json import read_json
+from dopepp.core.json import cached
 from dopepp.drawing.pictures import RGBImage, read_rgb
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
 from dopepp.parts.part import Part
@@ -51,25 +47,16 @@ def background_log_odds(
         measure: Searches images for the part; called if the cache has no level of the part.
     """
     symmetries = [part.symmetries_discrete, part.symmetries_continuous]
-    key = repr((VERSION, MARGIN, part.mesh_hash, part.diameter, distances, tilt, symmetries))
-    path = cache_folder() / "templates" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"
-    try:
-        level = read_json(path)
-        if isinstance(level, float):
-            return level
-    except (OSError, UserError):
-        pass  # the level has not been measured yet, or its file is damaged
-    logger.info("%s: measuring false detections on photos; the result is cached", part.name)
+    key = (VERSION, MARGIN, part.mesh_hash, part.diameter, distances, tilt, symmetries)
     focal = PART_PX * float(np.sqrt(distances[0] * distances[1])) / part.diameter
     K = camera_matrix(focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-    levels = measure(_photos(), K)
-    level = max(LOWEST, float(np.mean(levels) + MARGIN * np.std(levels)))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, json.dumps(level).encode())
-    except OSError as error:
-        logger.warning("%s: cannot cache the measured level: %s", part.name, error)
-    return level
+
+    def make() -> float:
+        logger.info("%s: measuring false detections on photos; the result is cached", part.name)
+        levels = measure(_photos(), K)
+        return max(LOWEST, float(np.mean(levels) + MARGIN * np.std(levels)))
+
+    return cached("templates", key, float, make)
 
 
 def _photos() -> Iterator[RGBImage]:

@@ -10,6 +10,7 @@ import io
 import logging
 from pathlib import Path
 from typing import Any, Final
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -83,6 +84,6 @@ def _read_pieces(path: Path) -> tuple[Piece, ...]:
         with np.load(path, allow_pickle=False) as content:
             vertices, counts = np.asarray(content["vertices"], np.float64), content["counts"]
         return tuple(np.split(vertices, np.cumsum(counts)[:-1]))
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
         fix = "delete this file; the next run creates the file again"
         raise UserError(f"{path}: {error}", "a file written by dopepp", fix) from error

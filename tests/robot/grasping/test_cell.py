@@ -34,6 +34,16 @@ def test_a_part_without_a_mesh_has_no_pieces(part):
         convex_pieces(replace(part, mesh=None))
 
 
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"text"])
+def test_damaged_pieces_are_named(part, tmp_path, monkeypatch, content):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = tmp_path / "dopepp" / "solids" / f"{'0' * 16}.npz"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=rf"{path.name}: .* fix: delete this file"):
+        convex_pieces(replace(part, mesh_hash="0" * 64))
+
+
 def test_a_solid_has_the_pose_at_which_it_was_placed(part):
     cell = Cell([make_body(part, is_target=True)] * 2)
     state = cell.data()
