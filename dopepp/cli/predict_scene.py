@@ -104,21 +104,21 @@ def track_scene(
             folder = save / f"{number}_{stem}"
             drawn.append(files.enter_context(Outputs([(folder, OverlayFolder(folder))])))
             drawn[-1].begin(source)
-        for number, frames in enumerate(zip_longest(*(source.frames() for source in sources))):
+        for number, frames in enumerate(zip_longest(*(source.frames() for source in sources)), 1):
             if None in frames:  # a video whose header states more frames
                 raise differ
             given = _posed(frames, poses, camera)
             result = tracker.track(*given[:3], camera_error=poses.error, names=given.names)
-            _show(result, {"number": number}, f"{number + 1}/{counts[0]}: ")
+            _show(result, f"{number}/{counts[0]}: ")
             written.write(result)
             for output, view, frame in zip(drawn, result.views, frames, strict=False):
                 output.write(replace(view, number=frame.number, time=frame.time))
 
 
-def _show(result: ViewsResult, shared: dict[str, object] | None = None, progress: str = "") -> None:
-    """Print a line of JSON (with ``shared``) for each part, and findings and summary on stderr."""
+def _show(result: ViewsResult, progress: str = "") -> None:
+    """Print a line of JSON for each part, and findings and summary on stderr."""
     for record in result.records():
-        typer.echo(json.dumps({**(shared or {}), **record}, ensure_ascii=False))
+        typer.echo(json.dumps(record, ensure_ascii=False))
     for line in (*result.findings, f"{progress}{result.summary}"):
         typer.echo(line, err=True)
 

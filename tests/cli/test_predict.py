@@ -213,6 +213,7 @@ def test_several_views_of_a_scene(run, tmp_path):
     assert [(line["number"], line["identity"]) for line in lines] == [(0, 0), (1, 0)]
     assert np.linalg.norm(np.array(lines[1]["T_world_obj"]) - target, axis=0)[3] < 5e-4
     written = [json.loads(line) for line in (tmp_path / "sets.json").read_text().splitlines()]
+    assert [line["number"] for line in written] == [0, 1]
     assert [line["images"] for line in written] == [["a/7.png", "b/7.png"], ["a/8.png", "b/8.png"]]
     files = {str(file.relative_to(tmp_path / "drawn")) for file in tmp_path.glob("drawn/*/*")}
     assert files == {"0_a/7.png", "0_a/8.png", "1_b/7.png", "1_b/8.png"}

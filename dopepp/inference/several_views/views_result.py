@@ -101,6 +101,7 @@ class ViewsResult:
     identities: Sequence[int] | None = None  # tracked instances; None without a tracker
     # Motion of each tracked part per set of images, in world axes; see Track
     velocities: Sequence[Step] | None = None
+    number: int | None = None  # index of the set of images, from 0; None without a tracker
 
     @property
     def num_weaker(self) -> int:
@@ -123,17 +124,19 @@ class ViewsResult:
         return np.ascontiguousarray(np.hstack(resized))
 
     def records(self) -> list[dict[str, Any]]:
-        """Return each detection as a dictionary for JSON, with its identity if it is tracked."""
+        """Return each detection as a dictionary for JSON, with number and identity if tracked."""
         records = [detection.to_record() for detection in self.detections]
         if self.identities is None:
             return records
         pairs = zip(self.identities, records, strict=True)
-        return [{"identity": identity, **record} for identity, record in pairs]
+        shared = {"number": self.number}
+        return [{**shared, "identity": identity, **record} for identity, record in pairs]
 
     def to_json(self) -> str:
-        """Return image names, contradictions ("findings") and detections as one line of JSON."""
-        images = [view.name for view in self.views]
-        content = {"images": images, "findings": list(self.findings), "detections": self.records()}
+        """Return image names, contradictions ("findings") and detections as a line of JSON."""
+        images, findings = [view.name for view in self.views], list(self.findings)
+        number = {} if self.number is None else {"number": self.number}
+        content = {**number, "images": images, "findings": findings, "detections": self.records()}
         return json.dumps(content, ensure_ascii=False, allow_nan=False)
 
     def save(self, folder: Path | str) -> None:

@@ -63,7 +63,8 @@ class ViewsTracker(Tracker[WorldDetection]):
         identities = [track.identity for track in tracks]
         velocities = [track.velocity for track in tracks]
         found = parts, self._findings, (), before, identities, velocities
-        return views_result(self.estimator, self._joint, *found)
+        result = views_result(self.estimator, self._joint, *found)
+        return replace(result, number=self._frame - 1)
 
     def _distance(self, pose: Transform) -> float:
         depths = [float(view.pose(pose)[2, 3]) for view in self._joint.views]
