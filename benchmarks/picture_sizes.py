@@ -19,7 +19,7 @@ from common import pose_errors, print_head, print_row, use_one_thread
 
 from dopepp.geometry.camera import resize_camera
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.network_input import Distances
+from dopepp.inference.input_image import Distances
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory, Scene, render
 from dopepp.virtual.sensor import capture

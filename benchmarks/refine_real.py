@@ -46,7 +46,7 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.rotation import nearest_rotation
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.network_input import read_depth_image
+from dopepp.inference.input_image import read_depth_image
 from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.inference.refinement.region import RegionRefiner

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.inference.frames import CameraFrame, FrameSource
-    from dopepp.inference.network_input import Distances
+    from dopepp.inference.input_image import Distances
     from dopepp.inference.several_views.view_files import CameraPoses
     from dopepp.inference.several_views.views_result import ViewsResult
 

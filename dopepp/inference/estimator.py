@@ -30,13 +30,7 @@ from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference import runtimes
-from dopepp.inference.network_input import (
-    Coefficients,
-    Depth,
-    Distances,
-    Region,
-    prepare_image,
-)
+from dopepp.inference.input_image import Coefficients, Depth, Distances, Region, prepare_image
 from dopepp.inference.pose_result import STEPS
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import PROBABLE, Detection, RecoveryOptions, recalibrate

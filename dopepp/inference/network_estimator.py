@@ -14,13 +14,8 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference import runtimes
 from dopepp.inference.estimator import PoseEstimator, SeenMaps, check_device
-from dopepp.inference.network_input import (
-    Distances,
-    NetworkView,
-    Region,
-    merge_scales,
-    network_views,
-)
+from dopepp.inference.input_image import Distances, Region
+from dopepp.inference.network_input import NetworkView, merge_scales, network_views
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import CANDIDATE, PROBABLE, Detection, RecoveryOptions

@@ -18,7 +18,7 @@ from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_formats import Size
 from dopepp.inference.frames import CameraFrame, SourceLike, open_sources
 from dopepp.inference.frames.source import Lens, choose_camera
-from dopepp.inference.network_input import Depth, Distances, Region, prepare_image
+from dopepp.inference.input_image import Depth, Distances, Region, prepare_image
 from dopepp.inference.pose_result import PoseResult, Shape, make_shape
 from dopepp.inference.tracker import PoseTracker
 from dopepp.recovery.detection import Detection

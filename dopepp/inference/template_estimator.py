@@ -23,15 +23,8 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator, SeenMaps
-from dopepp.inference.network_input import (
-    METRES,
-    Depth,
-    Distances,
-    Region,
-    are_same,
-    check_region,
-    merge_scales,
-)
+from dopepp.inference.input_image import METRES, Depth, Distances, Region, check_region
+from dopepp.inference.network_input import are_same, merge_scales
 from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.inference.templates import TemplateDetector, distinct_poses
 from dopepp.inference.templates.background_level import background_log_odds

@@ -26,8 +26,8 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Step, Transform, project_keypoints, transform
+from dopepp.inference.input_image import Region, prepare_image
 from dopepp.inference.motion import Motion, at_rest
-from dopepp.inference.network_input import Region, prepare_image
 from dopepp.recovery.detection import Detection
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Sizes of the network's input, merging of their detections, and checks of depth images."""
+"""Sizes of the network's input, and merging of their detections."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -23,12 +23,9 @@ from dopepp.geometry.camera import (
 from dopepp.inference.network_input import (
     MARGIN,
     MAX_PIXELS,
-    check_depth,
     letterboxes,
     merge_scales,
     network_views,
-    read_depth_image,
-    undistort_depth,
 )
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.size import LearnedRange
@@ -224,40 +221,6 @@ def test_region_is_processed_like_a_separate_image(estimator, scenes):
 def test_region_outside_the_image_is_rejected(estimator, roi):
     with pytest.raises(UserError, match="roi"):
         estimator.predict(blank_image(128, 128), camera_matrix(110, 110, 63.5, 63.5), roi=roi)
-
-
-@pytest.mark.parametrize(
-    ("depth", "message"),
-    [
-        (np.ones((2, 3), np.float32), r"depth of shape \(2, 3\) for an image of 4×3"),
-        (np.full((3, 4), 800, np.uint16), "depth of type uint16"),
-        (np.full((3, 4), 800.0, np.float32), "median of 800 m.*divide by 1000"),
-        (np.full((3, 4), -1.0, np.float32), "values down to -1"),
-    ],
-)
-def test_impossible_depth_is_rejected(depth, message):
-    with pytest.raises(UserError, match=message):
-        check_depth(depth, (4, 3))
-    unknown = np.array([[np.nan, np.inf], [0.0, 1.5]])
-    assert_allclose(check_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
-
-
-def test_undistorted_depth_has_no_new_values():
-    depth = np.where(np.arange(64) < 32, 0.5, 2.0).astype(np.float32)[None].repeat(48, axis=0)
-    small = camera_matrix(60, 60, 31.5, 23.5)
-    moved = undistort_depth(depth, small, np.array([-0.2, 0.05, 0, 0]))
-    assert set(np.unique(moved)) <= {0.0, 0.5, 2.0}
-
-
-def test_read_depth(tmp_path):
-    path = tmp_path / "depth.png"
-    cv2.imwrite(str(path), np.array([[0, 1000], [250, 65535]], np.uint16))
-    assert_allclose(read_depth_image(path, 0.001), [[0, 1], [0.25, 65.535]])
-    with pytest.raises(UserError, match="depth scale 0"):
-        read_depth_image(path, 0.0)
-    cv2.imwrite(str(path), np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(UserError, match="16 bits"):
-        read_depth_image(path, 0.001)
 
 
 def test_depths_of_a_view_show_the_part_at_trained_sizes():

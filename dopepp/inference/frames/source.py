@@ -12,7 +12,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop, read_camera
 from dopepp.geometry.camera_formats import Size
-from dopepp.inference.network_input import Depth32, read_depth_image, undistort_depth
+from dopepp.inference.input_image import Depth32, read_depth_image, undistort_depth
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ import numpy as np
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, rotation_lever
 from dopepp.geometry.rotation import RotationMatrix, Vector
-from dopepp.inference.network_input import Depth
+from dopepp.inference.input_image import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.part_surface import SurfacePoints
 from dopepp.inference.refinement.region import (

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, crop_camera
-from dopepp.inference.network_input import Depth
+from dopepp.inference.input_image import Depth
 
 Mask = Bool[np.ndarray, "height width"]  # True at the selected pixels
 Points = Float[np.ndarray, "points 3"]

@@ -39,7 +39,7 @@ from dopepp.geometry.camera import (
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.pnp import solve_pnp, sqpnp
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.inference.network_input import Depth
+from dopepp.inference.input_image import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.joint_refinement import (
     JointRefinement,

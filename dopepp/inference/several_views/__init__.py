@@ -25,7 +25,7 @@ from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Step, Transform, invert_transform
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import is_rigid
-from dopepp.inference.network_input import Depth, Distances, Region, prepare_image
+from dopepp.inference.input_image import Depth, Distances, Region, prepare_image
 from dopepp.inference.pose_result import PoseResult, Shape, elapsed_by_step
 from dopepp.inference.refinement.joint_refinement import PosedImage
 from dopepp.inference.several_views.contradictions import contradictions

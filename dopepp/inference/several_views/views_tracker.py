@@ -16,8 +16,8 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.camera_file import Camera
+from dopepp.inference.input_image import Depth, Region
 from dopepp.inference.motion import Motion
-from dopepp.inference.network_input import Depth, Region
 from dopepp.inference.refinement.solver import Prior
 from dopepp.inference.several_views import joint_estimator, search, views_result
 from dopepp.inference.several_views.joint import JointEstimator

@@ -34,7 +34,8 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.geometry.symmetry import symmetry_group
-from dopepp.inference.network_input import MAX_PIXELS, Region
+from dopepp.inference.input_image import Region
+from dopepp.inference.network_input import MAX_PIXELS
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.inference.templates.matching import STRIDE, Matches, match
 from dopepp.inference.templates.ranking import (

@@ -379,7 +379,7 @@ class Trials:
         self, image: RGBImage, lens: Camera, T_base_cam: Transform, parts: Sequence[EstimatedPart]
     ) -> Unexplained | None:
         """Return the regions of a heap's image that probably show undetected parts, if any."""
-        from dopepp.inference.network_input import prepare_image
+        from dopepp.inference.input_image import prepare_image
 
         if self.task.layout != "heap":
             return None

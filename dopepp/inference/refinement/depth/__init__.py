@@ -21,7 +21,7 @@ import numpy as np
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform, transform
-from dopepp.inference.network_input import Depth
+from dopepp.inference.input_image import Depth
 from dopepp.inference.refinement.depth.terms import DepthTerm
 from dopepp.inference.refinement.part_surface import (
     GATE,
