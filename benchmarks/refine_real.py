@@ -47,11 +47,11 @@ from dopepp.geometry.rotation import nearest_rotation
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.input_image import read_depth_image
+from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.refinement.refiner import Refiner
 from dopepp.inference.refinement.region import RegionRefiner
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
-from dopepp.inference.refinement.verification import SharpEdges
 from dopepp.metrics.functional import mahalanobis
 from dopepp.metrics.pose import assign
 from dopepp.parts.part import Part

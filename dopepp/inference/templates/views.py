@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, make_transform
 from dopepp.geometry.rotation import RotationMatrix
+from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import OutlineMesh, find_contour, posed
-from dopepp.inference.refinement.verification import SharpEdges
 
 NUM_VIEWS: Final = 600  # directions on the sphere, about 8 degrees apart
 NUM_POINTS: Final = 64  # number of points on the edges of a view

@@ -9,9 +9,10 @@ import trimesh
 
 from dopepp.geometry.camera import camera_matrix, make_transform, move_pose, project, transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.refinement.refiner import Refiner
-from dopepp.inference.refinement.verification import EVIDENCE, SharpEdges, Verifier, learned_model
+from dopepp.inference.refinement.verification import EVIDENCE, Verifier, learned_model
 from dopepp.parts.part import make_part
 from dopepp.recovery.detection import Detection
 from dopepp.virtual.factory import Factory
