@@ -1,6 +1,6 @@
 """Detections with their calibrated scores and covariances, and the options of the recovery.
 
-``evaluate.py tune=true`` fits three corrections on validation images with the functions ``fit_*``:
+``evaluate.py tune=true`` fits three corrections on validation images:
 
 - Distance: a network's keypoints are means over the poses that it considers possible, and the mean
   of a rotated shape is smaller. Poses are therefore too far away, by about the same factor.
@@ -20,10 +20,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse
 from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
@@ -50,16 +49,9 @@ PROBABLE: Final = 0.5
 
 PASSING: Final = 0.1  # ADD, in diameters, below which a pose is correct
 
-# Squared Mahalanobis distances that 75 % and 10 % of 6D Gaussian errors exceed.
-_QUARTER: Final = 3.455
-_TENTH_BEYOND: Final = 10.645
-_WRONG_RANGE: Final = math.log(1e6)  # range of ln(squared distance) of wrong poses
 _CERTAIN: Final = 1e-3  # beliefs are clipped to this distance from 0 and 1
-_EXPONENTS: Final = 4.0  # limit of logarithms and Newton steps, so that outliers do not dominate
+_MAX_LOGARITHM: Final = 8.0  # limit of a feature, so that outliers do not dominate
 _TYPICAL_MISFIT: Final = 0.01  # average reprojection error / size in the image
-_RIDGE: Final = 0.1  # weight of the squared weights, in detections; keeps the weights finite
-_DEFAULTS_RIDGE: Final = 1.0  # weight of the squared distance from default weights, in detections
-_STEPS: Final = 50  # maximum number of iterations of a fit
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
 _VERIFIED: Final = 1e-4  # verified probabilities are limited to this distance from 0 and 1
 
@@ -306,7 +298,7 @@ def detection_features(
     misfit = max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT)
     logarithms = np.log([_odds(detection.belief), max(spread, 1e-9) / PASSING, misfit])
     missing = float(np.isfinite(detection.peaks).all(axis=1).mean()) - 1
-    return np.array([1.0, *np.clip(logarithms, -2 * _EXPONENTS, 2 * _EXPONENTS), missing])
+    return np.array([1.0, *np.clip(logarithms, -_MAX_LOGARITHM, _MAX_LOGARITHM), missing])
 
 
 def log_odds(probability: float) -> float:
@@ -330,102 +322,6 @@ def score(
 ) -> Float[np.ndarray, "*n"]:
     """Return the probability, in (0, 1), that each pose is correct, by a logistic model."""
     return np.asarray(1 / (1 + np.exp(-np.clip(features @ weights, -30, 30))))
-
-
-def fit_distance_factor(
-    estimated: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
-) -> float:
-    """Return the median ratio of true to estimated distance, from T_cam_obj; 1 without poses."""
-    if not len(estimated):
-        return 1.0
-    distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
-    return float(np.clip(np.median(distances[0] / distances[1]), *DISTANCE_FACTORS))
-
-
-def fit_covariance_factor(
-    squared_distances: Float[np.ndarray, "n"], *, refined: bool = False
-) -> float:
-    """Return the factor by which covariances must be multiplied to match the poses' errors.
-
-    The squared distances are a mixture: of correct poses, with a multiple of χ² with six degrees of
-    freedom, and of wrong poses, with uniform logarithms. Expectation-maximisation separates the
-    two. The factor matches the 90 % quantile of the correct poses: their errors have heavier tails
-    than a Gaussian, and refinement, which uses the covariance as its prior, must reach the true
-    pose.
-
-    Args:
-        squared_distances: Squared Mahalanobis distances of estimated from true poses, under the
-            uncorrected covariances.
-        refined: Whether the poses were refined.
-
-    Raises:
-        UserError: The factor is outside :data:`COVARIANCE_FACTORS`, or for refined poses outside
-            :data:`REFINED_COVARIANCE_FACTORS`.
-    """
-    squared = np.asarray(squared_distances, np.float64)
-    squared = squared[np.isfinite(squared) & (squared > 0)]
-    if not len(squared):
-        return 1.0
-    factor, share = float(np.quantile(squared, 0.25)) / _QUARTER, 0.5
-    for _ in range(_STEPS):
-        ratio = squared / factor
-        # Densities of the logarithm: s·χ²₆(s) of correct poses, and a constant for incorrect poses.
-        right = share * ratio**3 * np.exp(-ratio / 2) / 16
-        certainty = right / (right + (1 - share) / _WRONG_RANGE)
-        share = float(np.clip(certainty.mean(), 0.01, 0.99))
-        factor = float((certainty * squared).sum() / (6 * max(certainty.sum(), 1e-9)))
-    order = np.argsort(squared)
-    passed = np.cumsum(certainty[order]) / certainty.sum()
-    factor = float(squared[order[np.searchsorted(passed, 0.9)]]) / _TENTH_BEYOND
-    low, high = REFINED_COVARIANCE_FACTORS if refined else COVARIANCE_FACTORS
-    if not low <= factor <= high:
-        tendency = "confident" if factor > high else "cautious"
-        causes = f"train longer, because the network is far too {tendency}; or, if"
-        if refined:
-            causes = f"the refinement is far too {tendency}; check the mesh and scale_error; if"
-        raise UserError(
-            f"covariances that must be multiplied by {factor:.3g} to match the poses' errors",
-            f"a factor from {low:g} to {high:g}",
-            f"{causes} the part looks the same in several orientations, state its symmetries with "
-            "data.symmetries=auto",
-        )
-    return factor
-
-
-def fit_weights(
-    features: Float[np.ndarray, "n features"],
-    correct: Bool[np.ndarray, "n"],
-    defaults: Float[np.ndarray, "features"] | None = None,
-) -> Float[np.ndarray, "features"]:
-    """Fit the weights of :func:`score` by maximum likelihood (Newton's method) and a ridge penalty.
-
-    Args:
-        features: Features of the detections.
-        correct: Whether each pose is correct; False for a detection where there is no part.
-        defaults: Weights from which deviations are penalised (default: 0).
-
-    Raises:
-        ValueError: All or no detections are correct.
-    """
-    correct = np.asarray(correct, bool)
-    if not correct.any() or correct.all():
-        raise ValueError("a score needs correct and incorrect detections to learn from")
-    if defaults is None:
-        defaults = np.zeros(features.shape[1])
-        ridge = _RIDGE * np.eye(len(defaults))
-        ridge[0, 0] = 0.0  # the share of correct detections is well determined
-    else:
-        ridge = _DEFAULTS_RIDGE * np.eye(len(defaults))
-    weights = defaults.copy()
-    for _ in range(_STEPS):
-        predicted = score(features, weights)
-        gradient = features.T @ (correct - predicted) - ridge @ (weights - defaults)
-        hessian = (features * (predicted * (1 - predicted))[:, None]).T @ features + ridge
-        step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
-        weights = weights + step * min(1.0, _EXPONENTS / max(float(np.abs(step).max()), 1e-12))
-        if np.abs(step).max() < 1e-9:
-            break
-    return weights
 
 
 @compiled()

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 
 from dopepp.data.sample import Sample, SampleSource
+from dopepp.experiment.run.calibration_fits import fit_covariance_factor, fit_distance_factor
 from dopepp.experiment.run.scored_detections import Match, matched_poses
 from dopepp.geometry.camera import make_transform, project
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -19,7 +20,6 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.region.shared_errors import SCALE_ERROR
 from dopepp.metrics.functional import mahalanobis
 from dopepp.parts.part import Parts
-from dopepp.recovery.detection import fit_covariance_factor, fit_distance_factor
 
 MIN_REFINED_FACTOR: Final = 0.5
 """Smallest covariance factor of refined poses. Smaller factors fit renders at the network's

@@ -29,6 +29,7 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.negative_frames import negative_frames
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import FalsePositiveTarget
+from dopepp.experiment.run.calibration_fits import fit_weights
 from dopepp.experiment.run.scored_detections import (
     DetectionQuality,
     ScoredDetections,
@@ -48,7 +49,6 @@ from dopepp.recovery.detection import (
     PROBABLE,
     REFINED_FEATURES,
     RecoveryOptions,
-    fit_weights,
     score,
 )
 
