@@ -52,9 +52,18 @@ def test_a_hanging_process_is_ended(tmp_path):
     assert message.endswith("was killed by signal 9: the run ends\n")
 
 
-def test_a_stopped_watch_lets_processes_end():
+def end_normally():
+    processes._POLL_S = processes._GRACE_S = 0.2
     child = sleeper("raise SystemExit(3)")
     watch = Watch([child], None)
+    watch.start()
     watch.stop()
-    watch.run()  # returns at once, without ending this process
     child.wait()
+    watch.join(100)
+
+
+def test_a_stopped_watch_lets_processes_end():
+    process = multiprocessing.get_context("fork").Process(target=end_normally)
+    process.start()
+    process.join(100)
+    assert process.exitcode == 0

@@ -59,9 +59,19 @@ class FakePlanner:
         height = round(1000 * poses[0][2, 3])
         self.planned.append(height)
         quality = self.qualities.get(height)
-        if unexplained is not None and height in unexplained:
+        if unexplained is not None and unexplained.blocks(poses[0], 0.05):
             return None
         return None if quality is None else SimpleNamespace(quality=quality)
+
+
+class Blocked:
+    """Regions that block grasps of parts at the listed heights, mm."""
+
+    def __init__(self, *heights):
+        self.heights = heights
+
+    def blocks(self, T_base_tool, opening):
+        return round(1000 * T_base_tool[2, 3]) in self.heights
 
 
 def choose(planner, parts, failed=(), unexplained=None):
@@ -90,9 +100,11 @@ def test_a_part_that_was_not_grasped_is_tried_after_the_others_until_it_moves():
 def test_a_part_beside_an_unexplained_region_is_chosen_last():
     lower, upper = EstimatedPart(at(0.0, 0.0)), EstimatedPart(at(0.3, 0.001))
     planner = FakePlanner(z0=1.0, z1=0.5)
-    assert choose(planner, [lower, upper], unexplained=()) == 0
-    assert choose(planner, [lower, upper], unexplained=(0,)) == 1
-    assert choose(planner, [lower, upper], unexplained=(0, 1)) == 0  # there is no other grasp
+    assert choose(planner, [lower, upper], unexplained=Blocked()) == 0
+    assert choose(planner, [lower, upper], unexplained=Blocked(0)) == 1
+    assert (
+        choose(planner, [lower, upper], unexplained=Blocked(0, 1)) == 0
+    )  # there is no other grasp
 
 
 COVARIANCE = np.diag(np.repeat([np.radians(0.3), 1e-3], 3) ** 2)
