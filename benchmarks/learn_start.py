@@ -37,8 +37,9 @@ from dopepp.data.batch import Batch, collate
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.sample import Sample
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule
 from dopepp.experiment.assembly.build_system import build_system
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.assembly.photos import training_backgrounds
 from dopepp.experiment.assembly.renders import training_renders
 from dopepp.experiment.config.run_config import RunConfig

@@ -25,8 +25,9 @@ from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
 from dopepp.drawing.pictures import RGBImage
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import fit_to_camera, labelled_images
+from dopepp.experiment.assembly.build_sources import labelled_images
 from dopepp.experiment.assembly.build_system import build_system
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.assembly.renders import training_preset
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results.folder import CONFIG_FILE

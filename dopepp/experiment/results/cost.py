@@ -28,8 +28,9 @@ from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import fit_to_camera, held_out_source
+from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.build_system import build_untrained
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.config.run_config import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import (

@@ -24,8 +24,9 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule
 from dopepp.experiment.assembly.build_system import build_system, build_trainer
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.config.run_config import LearningRateConfig, RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment

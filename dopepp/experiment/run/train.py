@@ -25,8 +25,9 @@ from dopepp.core.errors import Interruption, RunError, UserError
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule
 from dopepp.experiment.assembly.build_system import build_system, build_trainer, keep_freed_memory
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.assembly.photos import held_out_photos
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.experiment.config.run_config import RunConfig, TrainerConfig
@@ -43,9 +44,10 @@ from dopepp.experiment.results.folder import (
 from dopepp.experiment.results.paper import PaperTable
 from dopepp.experiment.results.recording import measure_and_record, refining
 from dopepp.experiment.results.report import Report
+from dopepp.experiment.run.described_images import describe_images
 from dopepp.experiment.run.evaluate import tune_and_record
 from dopepp.experiment.run.lr_finder import find_learning_rate
-from dopepp.experiment.run.resume import check_resume, describe_images, remember_overrides
+from dopepp.experiment.run.resume import check_resume, remember_overrides
 from dopepp.experiment.run.tracking import log_report, open_trackers
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import refine_terms

@@ -21,9 +21,9 @@ from dopepp.data.rendered import RenderedSource
 from dopepp.experiment.assembly.build_parts import build_negatives, build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
-    fit_to_camera,
     held_out_source,
 )
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.assembly.negative_frames import frame_view, negative_frames
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.results.false_alarms import frames_without_parts

@@ -12,9 +12,9 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_sources import (
     build_datamodule,
-    fit_to_camera,
     held_out_source,
 )
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.config.data_config import evaluation_data
 from dopepp.experiment.run import train
 from dopepp.experiment.run.train import template_commands

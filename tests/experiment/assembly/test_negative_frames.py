@@ -18,7 +18,7 @@ from dopepp.experiment.assembly.negative_frames import (
     negative_frames,
 )
 from dopepp.experiment.assembly.photos import held_out_photos, training_backgrounds
-from dopepp.experiment.run.resume import describe_images, differing_images
+from dopepp.experiment.run.described_images import describe_images, differing_images
 
 pytestmark = pytest.mark.usefixtures("quick_sky")
 

@@ -2,7 +2,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_parts import build_parts
-from dopepp.experiment.assembly.build_sources import build_datamodule, fit_to_camera
+from dopepp.experiment.assembly.build_sources import build_datamodule
+from dopepp.experiment.assembly.camera_fit import fit_to_camera
 from dopepp.experiment.run.train import _progress
 from dopepp.training.refined_progress import RefinedProgress
 

@@ -19,11 +19,10 @@ from dopepp.experiment.results.folder import (
     write_config,
     write_json,
 )
+from dopepp.experiment.run.described_images import describe_images, differing_images
 from dopepp.experiment.run.resume import (
     check_resume,
     config_differences,
-    describe_images,
-    differing_images,
     read_overrides,
     trusted_overrides,
 )
