@@ -16,7 +16,7 @@ from dopepp.core.files import write_image
 from dopepp.data.rendered import RenderedSource
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import RGBImage
-from dopepp.drawing.sheet import Tile, contact_sheet, grid, heat_picture
+from dopepp.drawing.sheet import Tile, contact_sheet, grid, heat_image
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts import Part, pivconnector
@@ -62,7 +62,7 @@ def chain() -> RGBImage:
     tiles = [
         Tile(part_on_white(part), "an STL"),
         Tile(renders, "renders, which a network learns"),
-        Tile(heat_picture(scene.image, beliefs, SIDE // beliefs.shape[0]),
+        Tile(heat_image(scene.image, beliefs, SIDE // beliefs.shape[0]),
              "where it believes corners on a new image"),
         Tile(overlay(scene.image, [Wireframe(pose.keypoints)], SIDE), "the pose, refined"),
     ]  # fmt: skip

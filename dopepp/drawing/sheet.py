@@ -117,12 +117,12 @@ def belief_tiles(
     """
     maps = {"corners": beliefs[:CENTROID].max(axis=0), "centroid": beliefs[CENTROID]}
     return [
-        Tile(heat_picture(image, belief, stride), f"{name} {title}, max {belief.max():.2f}")
+        Tile(heat_image(image, belief, stride), f"{name} {title}, max {belief.max():.2f}")
         for title, belief in maps.items()
     ]
 
 
-def heat_picture(
+def heat_image(
     image: RGBImage, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
 ) -> RGBImage:
     """Blend the belief map ``channel`` (0 to 1) into the dimmed image, with opacity 0.8 × belief.

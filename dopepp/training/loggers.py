@@ -136,7 +136,7 @@ class GuardedLogger(Logger):
         """Finalise the wrapped logger with the status of the run."""
         self._forward(lambda inner: inner.finalize(status))
 
-    def log_picture(self, name: str, image: RGBImage, step: int | None = None) -> None:
+    def log_image(self, name: str, image: RGBImage, step: int | None = None) -> None:
         """Log an RGB image with TensorBoard or Weights & Biases; other loggers ignore the image."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):

@@ -126,7 +126,7 @@ class AUCCurves(Callback):
         folder = Path(trainer.default_root_dir)
         with best_effort(f"{folder}/val_auc"):
             figure = save_accuracy_curves(folder / "val_auc", curves, title=title)
-            _log_picture(trainer, "val/auc", figure_image(figure))
+            _log_image(trainer, "val/auc", figure_image(figure))
 
 
 class ValidationSheet(Callback):
@@ -166,7 +166,7 @@ class ValidationSheet(Callback):
         path = Path(trainer.default_root_dir) / f"val_{self.name}.png"
         with best_effort(str(path)):
             write_png(path, sheet)
-        _log_picture(trainer, f"val/{self.name}", sheet)
+        _log_image(trainer, f"val/{self.name}", sheet)
 
 
 class Overlays(ValidationSheet):
@@ -205,10 +205,10 @@ class BeliefMaps(ValidationSheet):
         return tiles
 
 
-def _log_picture(trainer: Trainer, name: str, image: RGBImage) -> None:
+def _log_image(trainer: Trainer, name: str, image: RGBImage) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger):
-            logger.log_picture(name, image, trainer.global_step)
+            logger.log_image(name, image, trainer.global_step)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dopepp.drawing import curves, sheet
 from dopepp.drawing.curves import figure_image
 from dopepp.drawing.overlay import text_coverage
-from dopepp.drawing.sheet import Tile, contact_sheet, heat_picture
+from dopepp.drawing.sheet import Tile, contact_sheet, heat_image
 
 IMAGE = np.full((30, 40, 3), 100, np.uint8)
 RED, GREY = (200, 10, 10), (90, 90, 90)
@@ -181,7 +181,7 @@ def test_a_belief_covers_the_pixels_of_its_cell():
     image = np.full((90, 150, 3), 90, np.uint8)  # smaller than the maps, which include padding
     belief = np.zeros((12, 20), np.float32)
     belief[4, 11] = 1
-    heat = heat_picture(image, belief).astype(int)
+    heat = heat_image(image, belief).astype(int)
     assert heat.shape == image.shape
     hot = np.argwhere(np.abs(heat - 54).max(axis=2) > 100)  # 54 = the dimmed grey
     np.testing.assert_allclose(hot.mean(axis=0), [8 * 4 + 3.5, 8 * 11 + 3.5], atol=0.6)
@@ -190,5 +190,5 @@ def test_a_belief_covers_the_pixels_of_its_cell():
 
 def test_beliefs_beyond_their_range_are_clipped():
     image = np.full((96, 160, 3), 90, np.uint8)
-    first, seven = (heat_picture(image, np.full((12, 20), value, np.float32)) for value in (1, 7))
+    first, seven = (heat_image(image, np.full((12, 20), value, np.float32)) for value in (1, 7))
     np.testing.assert_array_equal(first, seven)

@@ -62,10 +62,10 @@ TEXT_FILE: Final = "compare.md"
 CURVES_FILE: Final = "compare_auc.png"
 PANELS_FILE: Final = "compare.png"
 LOSS_FILE: Final = "compare_loss.png"
-PICTURES_FILE: Final = "compare_pictures.png"
+IMAGES_FILE: Final = "compare_pictures.png"
 LOG_FILE: Final = "metrics.csv"
 
-NUM_PICTURES: Final = 3  # number of shown test images: the first, for an unbiased selection
+NUM_SHOWN: Final = 3  # number of shown test images: the first, for an unbiased selection
 
 # Columns of a log to draw: label, factor, and whether the axis is logarithmic.
 _LOGGED: Final = {
@@ -116,7 +116,7 @@ def compare_paths(
     paths: Sequence[Path],
     out: Path | None = None,
     baseline: str | None = None,
-    num_pictures: int = NUM_PICTURES,
+    num_shown: int = NUM_SHOWN,
     table: Path | None = None,
 ) -> Path:
     """Compare run folders and return the folder with the comparison.
@@ -133,14 +133,14 @@ def compare_paths(
             "a folder without a comparison",
             "pass another folder with --out",
         )
-    entries = compare_runs(runs, out, baseline, num_pictures)
+    entries = compare_runs(runs, out, baseline, num_shown)
     if layout is not None:
         write_paper_table(layout, entries, out)
     return out
 
 
 def compare_runs(
-    runs: Sequence[Run], folder: Path, baseline: str | None = None, num_pictures: int = NUM_PICTURES
+    runs: Sequence[Run], folder: Path, baseline: str | None = None, num_shown: int = NUM_SHOWN
 ) -> list[Entry]:
     """Compare runs, print and write the comparison, and return the methods.
 
@@ -156,9 +156,9 @@ def compare_runs(
     entries = with_refined(networks)
     page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
-    tiles, missing = image_tiles(networks, num_pictures)
+    tiles, missing = image_tiles(networks, num_shown)
     if tiles:
-        write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
+        write_png(folder / IMAGES_FILE, contact_sheet(tiles, len(networks)))
         width = 2 * max([panel.shape[1] for panel in panels], default=768)
         # Fewer than three columns would make the tiles too large; the gap is 12 pixels.
         sheet = contact_sheet(tiles, len(networks), width // max(3, len(networks)) - 12)

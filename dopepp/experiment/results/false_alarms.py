@@ -29,28 +29,28 @@ from dopepp.virtual.backgrounds import PhotoBackgrounds
 TITLE: Final = "Images without the part"
 KEY: Final = "without_part"  # key of `Report.details`: a `FalseAlarms` as a dictionary
 
-NUM_LOUDEST: Final = 6  # number of images with the highest scores to name and to draw
+NUM_HIGHEST: Final = 6  # number of highest-scoring images to name and to draw
 
 
 @dataclass(frozen=True)
 class FalseAlarms:
     """Detections of an estimator on images without its parts."""
 
-    num_pictures: int
-    per_picture: float  # reported detections
+    num_images: int
+    per_image: float  # reported detections
     threshold: float  # minimum score of a reported detection
-    loudest: dict[str, float]  # images with the highest scores of candidates, descending
+    highest: dict[str, float]  # highest-scoring images, with their best candidate's score
 
     def row(self, method: str) -> Row:
         """Return the texts of a method's table row, by heading."""
-        best = next(iter(self.loudest.values()), None)
+        best = next(iter(self.highest.values()), None)
         return {
             "method": method,
-            "images": f"{self.num_pictures:,}",
-            "detections per image": f"{self.per_picture:.3f}",
+            "images": f"{self.num_images:,}",
+            "detections per image": f"{self.per_image:.3f}",
             "threshold": f"{self.threshold:.3g}",
             "highest score": NOT_AVAILABLE if best is None else f"{best:.3g}",
-            "highest-scoring images": ", ".join(self.loudest),
+            "highest-scoring images": ", ".join(self.highest),
         }
 
 
@@ -105,18 +105,18 @@ def count_false_alarms(
     alarms, tiles = {}, []
     for name, estimator in estimators.items():
         num_reported = 0
-        loud: list[tuple[float, int]] = []
+        scored: list[tuple[float, int]] = []
         for index in range(len(frames)):
             sample = frames.sample(index)
             candidates = estimator.candidates(sample.image, sample.K, cropped=True)
             num_reported += len(estimator.split(candidates)[0])
-            loud += [(candidates[0].score, index)] if candidates else []
-        loud.sort(key=lambda pair: (-pair[0], pair[1]))
-        loudest = [(frames.sample(index), score) for score, index in loud[:NUM_LOUDEST]]
-        scores = {sample.key: score for sample, score in loudest}
+            scored += [(candidates[0].score, index)] if candidates else []
+        scored.sort(key=lambda pair: (-pair[0], pair[1]))
+        highest = [(frames.sample(index), score) for score, index in scored[:NUM_HIGHEST]]
+        scores = {sample.key: score for sample, score in highest}
         rate = num_reported / len(frames)
         alarms[name] = FalseAlarms(len(frames), rate, estimator.min_score, scores)
-        tiles = [_tile(estimator, sample) for sample, _ in loudest]
+        tiles = [_tile(estimator, sample) for sample, _ in highest]
     return alarms, tiles
 
 

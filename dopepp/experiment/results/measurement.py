@@ -249,14 +249,14 @@ class Measured:
 def measure(
     methods: Mapping[str, Method],
     samples: Iterable[Sample],
-    num_pictures: int = 12,
+    num_shown: int = 12,
     *,
     bop: bool = False,
 ) -> Measured:
     """Run methods (the baseline first) over the same images at their native size.
 
     AP, BOP scores and files of poses include all candidates; every other measure includes the
-    reported poses only. The ``num_pictures`` tiles show the ground truth in green, predictions of
+    reported poses only. The ``num_shown`` tiles show the ground truth in green, predictions of
     the last method in yellow and predictions of other methods in blue (paper Fig. 14).
     """
     metrics, ranked = accumulators(methods), accumulators(methods)
@@ -285,7 +285,7 @@ def measure(
             measured.poses[name] += [(image, candidate, taken) for candidate in candidates]
             colour = BLUE if number < len(methods) - 1 else YELLOW
             wireframes += [Wireframe(pose.keypoints, colour, name) for pose in poses]
-        if len(measured.tiles) < num_pictures:
+        if len(measured.tiles) < num_shown:
             measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
     scores = {name: localisation.scores() for name, localisation in localised.items()}
     measured.bop = {name: score for name, score in scores.items() if score is not None}

@@ -50,7 +50,7 @@ def measure_and_record(
     parts: Parts,
     data: DataConfig,
     run_dir: Path,
-    num_pictures: int,
+    num_shown: int,
     details: Mapping[str, Any] | None = None,
     *,
     results: Mapping[str, Path] | None = None,
@@ -89,7 +89,7 @@ def measure_and_record(
     samples = (source.sample(index, 0) for index in range(len(source)))
     is_bop = data.root is not None and data.format in ("bop", "webdataset")
     both = {**methods, **views}
-    measured = measure(both, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
+    measured = measure(both, samples, num_shown, bop=is_bop and not data.is_rendered("test"))
     for file in files.values():
         file.check_used()
     for report in measured.reports:
@@ -113,11 +113,11 @@ def measure_and_record(
         record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
     if protocols.shading:
         shaded = conditions.measure_shading(
-            methods, source, protocols.shading, data.eval_seed, measured.reports, num_pictures
+            methods, source, protocols.shading, data.eval_seed, measured.reports, num_shown
         )
         conditions.record_condition(run_dir, conditions.SHADING, *shaded, rates)
     if scaled:
-        levels = conditions.measure_scales(methods, scaled, measured, num_pictures)
+        levels = conditions.measure_scales(methods, scaled, measured, num_shown)
         conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
     display.show_files(run_dir)
     return main, measured.reports

@@ -34,7 +34,7 @@ from dopepp.experiment.results.pages import write_run_readme
 from dopepp.training.system import PoseSystem
 
 TABLE_FILE: Final = "lr_finder.csv"
-PICTURE_FILE: Final = "lr_finder.png"
+IMAGE_FILE: Final = "lr_finder.png"
 
 _MIN_STEPS: Final = 10
 _MOST: Final = 10**6  # maximum number of epochs; the number of steps ends the sweep
@@ -169,7 +169,7 @@ def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
         axes.axvline(steepest, color="C3", label=f"falls fastest: {steepest:.2g}")
         axes.axvline(lowest, color="C7", linestyle=":", label=f"lowest: {lowest:.2g}")
         axes.legend()
-    write_png(run_dir / PICTURE_FILE, figure_image(figure))
+    write_png(run_dir / IMAGE_FILE, figure_image(figure))
     text = (
         "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or check "
         "the data"
@@ -177,5 +177,5 @@ def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
         else f"suggested optimizer.lr={suggestion.steepest:.2g}, where the loss falls fastest; "
         f"the lowest loss is at {suggestion.lowest:.2g}"
     )
-    display.console.print(f"{text}; {run_dir / PICTURE_FILE}")
+    display.console.print(f"{text}; {run_dir / IMAGE_FILE}")
     return suggestion

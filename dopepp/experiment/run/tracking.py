@@ -20,7 +20,7 @@ from dopepp.core.files import read_csv
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.assembly.build_system import LOGGERS
 from dopepp.experiment.config.run_config import RunConfig
-from dopepp.experiment.results.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE
+from dopepp.experiment.results.compare import CURVES_FILE, IMAGES_FILE, LOSS_FILE
 from dopepp.experiment.results.compared_runs import TABLE_FILE, overrides_of
 from dopepp.experiment.results.frame import shown_rows
 from dopepp.experiment.results.paper import TABLE_FILE as PAPER_TABLE_FILE
@@ -110,7 +110,7 @@ def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
                 if rows:
                     text = (folder / file).with_suffix(".md").read_text()
                     tracker.log_table(Path(file).stem, rows, text)
-            names = (CURVES_FILE, PICTURES_FILE, LOSS_FILE, "table_shading.png", "frame_rate.png")
+            names = (CURVES_FILE, IMAGES_FILE, LOSS_FILE, "table_shading.png", "frame_rate.png")
             _send_images(tracker, {Path(name).stem: folder / name for name in names})
 
 
@@ -122,4 +122,4 @@ def _send_images(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
         except UserError:  # the file is truncated, for example by a full disk
             image = None
         if image is not None:
-            tracker.log_picture(name, image)
+            tracker.log_image(name, image)

@@ -294,7 +294,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
         parts,
         config.data,
         run_dir,
-        num_pictures=12,
+        num_shown=12,
         details=details,
         protocols=config.protocols,
         refine=config.refine,

@@ -127,7 +127,7 @@ def test_an_object_without_ground_truth_in_the_test_set_has_no_rates(tiny, ycb_r
     data = replace(config.data, frames=("0050/000003",))
     estimator = NetworkEstimator(*build_untrained(config, build_parts(data)))
     parts = parts_of([estimator], data)
-    report, _ = measure_and_record({"dopepp": estimator}, parts, data, tmp_path, num_pictures=1)
+    report, _ = measure_and_record({"dopepp": estimator}, parts, data, tmp_path, num_shown=1)
     present, absent = (report.rows[name] for name in ("003_cracker_box", "010_potted_meat_can"))
     assert present.num_instances == 1
     written = read_json(tmp_path / METRICS_FILE)["objects"]["010_potted_meat_can"]

@@ -94,7 +94,7 @@ def run_shading(source: MadeSource, folder: Path, num_examples: int = 2) -> None
     record_condition(folder, SHADING, *measured, RATES)
 
 
-def check_pictures(folder: Path, condition: Condition, columns: int) -> None:
+def check_images(folder: Path, condition: Condition, columns: int) -> None:
     sheet = cv2.imread(str(folder / f"{condition.name}_examples.png"))
     assert sheet.shape[1] > columns * 320
     assert cv2.imread(str(folder / f"{condition.name}.png")).std() > 0
@@ -141,7 +141,7 @@ def test_every_method_is_measured_at_every_share(tmp_path):
         assert rates[3] == pytest.approx(share, abs=0.001)
         assert float(row["auc_10cm"]) == pytest.approx(auc)
         assert row["median_rotation_deg"] == ("0.0" if seen else "")
-    check_pictures(tmp_path, SHADING, 4)
+    check_images(tmp_path, SHADING, 4)
 
 
 def test_unreached_shares_are_counted_and_reported(tmp_path, caplog):
@@ -194,4 +194,4 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
         assert rates == [3, seen, method == "dopepp", 1 - seen]
     assert "Evaluated instances at ×20: none; at ×1: 3, " in caplog.text
     assert [tile.caption for tile in tiles] == [f"test/0/0, ×{scale}" for scale in ("0.5", 1, 20)]
-    check_pictures(tmp_path, SCALE, 3)
+    check_images(tmp_path, SCALE, 3)

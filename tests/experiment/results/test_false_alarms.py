@@ -10,7 +10,7 @@ from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.results.false_alarms import (
     KEY,
-    NUM_LOUDEST,
+    NUM_HIGHEST,
     FalseAlarms,
     alarm_rows,
     count_false_alarms,
@@ -59,10 +59,10 @@ def test_detections_are_counted_from_the_threshold_on(folder, tiny):
     frames = frames_without_parts(folder / "photos", folder / "camera.yaml", tiny().data, [])
     alarms, tiles = count_false_alarms({"dopepp": Estimator()}, frames)
     # The better candidates of images 4 to 8 and the weaker of image 8 reach 0.39.
-    assert alarms["dopepp"].per_picture == pytest.approx(6 / 9)
-    loudest = {f"{number}.png": number / 10 for number in range(8, 8 - NUM_LOUDEST, -1)}
-    assert alarms["dopepp"].loudest == pytest.approx(loudest)
-    assert [tile.caption for tile in tiles] == list(alarms["dopepp"].loudest) == list(loudest)
+    assert alarms["dopepp"].per_image == pytest.approx(6 / 9)
+    highest = {f"{number}.png": number / 10 for number in range(8, 8 - NUM_HIGHEST, -1)}
+    assert alarms["dopepp"].highest == pytest.approx(highest)
+    assert [tile.caption for tile in tiles] == list(alarms["dopepp"].highest) == list(highest)
 
 
 def test_images_have_the_named_camera_or_the_camera_of_the_data(folder, tiny):

@@ -111,7 +111,7 @@ def test_detections_on_images_without_the_part_are_counted(evaluate, tmp_path, c
     (report,) = evaluate(NETWORK, "+data.num_test=1", f"negatives={folder}")
     counts = read_json(run / METRICS_FILE)["without_part"]
     assert counts == report.details["without_part"]
-    assert (counts["num_pictures"], counts["per_picture"]) == (1, 0)
+    assert (counts["num_images"], counts["per_image"]) == (1, 0)
     assert "Images without the part" in capsys.readouterr().out
     assert "## Images without the part\n\n| method |" in (run / "README.md").read_text()
 

@@ -16,7 +16,7 @@ RELEASED = Path("pretrained/pivconnector")
 
 
 @pytest.fixture(autouse=True)
-def _few_pictures(monkeypatch, tmp_path):
+def _few_images(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "NUM_CHECKED", 3)
     monkeypatch.chdir(tmp_path)
 
