@@ -46,4 +46,6 @@ def check_dataset(root: Path) -> CheckReport:
         raise UserError(f"{root}, {problem}", allowed, "pass the folder of the data set")
     report = CheckReport(root, layout)
     LAYOUTS[layout][1](report)
+    if report.ok and report.num_images == 0:
+        report.report(root, "images", "none found")
     return report

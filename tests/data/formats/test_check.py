@@ -650,3 +650,9 @@ def test_a_folder_of_unknown_layout_is_rejected(name, message, tmp_path):
     (tmp_path / "notes").mkdir()
     with pytest.raises(UserError, match=message):
         check_dataset(tmp_path / name)
+
+
+def test_a_data_set_without_images_has_a_defect(tmp_path):
+    settings = {"exported_object_classes": [], "exported_objects": []}
+    (tmp_path / "_object_settings.json").write_text(json.dumps(settings))
+    assert check_dataset(tmp_path).defects == [f"{tmp_path}: images: none found"]
