@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import CONF
+from dopepp.core.yaml import read_yaml
 from dopepp.experiment import program
 from dopepp.experiment.sweep import multirun
 
@@ -59,6 +60,8 @@ def prepare(open_nodes: Sequence[str], short_names: Mapping[str, str], num_words
         arguments = _resumed(arguments, Path(resume))
     elif folder:
         _refuse_used_folder(folder)
+    if "hydra.sweep.dir" in given and "search" not in given:
+        _refuse_other_multirun(given["hydra.sweep.dir"], arguments)
     sys.argv = [*words, *arguments]
 
 
@@ -71,6 +74,23 @@ def _refuse_used_folder(folder: str) -> None:
             f"hydra.run.dir={folder}, which holds a run",
             "a folder without a run",
             f"set another folder, or continue with resume={folder}",
+        )
+
+
+def _refuse_other_multirun(folder: str, arguments: Sequence[str]) -> None:
+    """Raise a UserError if a folder holds a multirun with other options, to keep its jobs."""
+    from dopepp.experiment.run.resume import task_overrides
+
+    path = Path(folder, "multirun.yaml")
+    stored = task_overrides(read_yaml(path)) if path.is_file() else None
+    given = [text for text in arguments if text[0] != "-" and ("=" in text or text[0] == "~")]
+    present = [text for text in given if not text.lstrip("~+").startswith(("hydra.", "hydra/"))]
+    if isinstance(stored, list) and (changed := set(map(str, stored)) ^ set(present)):
+        raise UserError(
+            f"hydra.sweep.dir={folder}, which holds a multirun that differs in "
+            f"{', '.join(sorted(changed))}",
+            "the options of that multirun, or a folder without jobs",
+            "repeat its command to continue it, or leave out hydra.sweep.dir",
         )
 
 

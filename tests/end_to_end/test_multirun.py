@@ -122,6 +122,15 @@ def test_they_end_in_one_table_dope_first(sweep):
     assert versions[0]["data_fingerprint"] == versions[1]["data_fingerprint"]
 
 
+def test_a_folder_of_another_multirun_is_refused_untouched(sweep, call):
+    files = {path: path.read_bytes() for path in sweep.rglob("*.[jcy]*") if path.is_file()}
+    line = call("train.py", "-m", "seed=1,2", f"hydra.sweep.dir={sweep}").line
+    assert f"got hydra.sweep.dir={sweep}, which holds a multirun that differs in" in line
+    assert "model=dopepp,dope" in line
+    assert "seed=1,2" in line
+    assert {path: path.read_bytes() for path in files} == files
+
+
 def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
     for job, model in (("0", "dopepp"), ("1", "dope")):
         run = only(sweep / job)

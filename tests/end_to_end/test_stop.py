@@ -110,6 +110,11 @@ def test_an_interrupted_sweep_keeps_what_is_finished(call, tiny, tmp_path):
     assert rows[1]["object"].startswith("failed: unfinished")
     assert not (sweep / "2").exists()
 
+    options = ("seed=1,2,3", f"output_dir={tmp_path}", f"hydra.sweep.dir={sweep}")
+    call("train.py", "-m", *tiny, *options, code=0)  # the page's way to continue
+    rows = read_csv(sweep / "compare.csv")
+    assert [row["seeds"] for row in rows[:1]] == ["1, 2, 3"]
+
 
 @pytest.fixture
 def small_disk(tmp_path):

@@ -171,7 +171,7 @@ def read_overrides(run: Path) -> list[str] | None:
     if not overrides.is_file():
         return None
     stored = read_yaml(overrides)
-    if hydra.is_file() and stored != _task(read_yaml(hydra)):
+    if hydra.is_file() and stored != task_overrides(read_yaml(hydra)):
         return None
     return trusted_overrides(stored, overrides)
 
@@ -185,7 +185,7 @@ def remember_overrides(run: Path) -> None:
     write_file(run / OVERRIDES, yaml.safe_dump(overrides).encode())
 
 
-def _task(hydra: object) -> object:
+def task_overrides(hydra: object) -> object:
     """Return the overrides in Hydra's stored config, except those of Hydra itself, or None."""
     for key in ("hydra", "overrides", "task"):
         hydra = hydra.get(key) if isinstance(hydra, dict) else None
