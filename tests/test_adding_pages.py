@@ -129,6 +129,8 @@ def test_the_documented_script_allows_a_callback_and_trains(monkeypatch):
     monkeypatch.setitem(sys.modules, "my_package", package)
     monkeypatch.setattr(entries, "start", started.append)
     monkeypatch.setattr(CALLBACKS, "_targets", {*CALLBACKS.targets})
-    exec(documented("adding-a-callback.md", 2))
-    assert started == ["train"]
+    exec(documented("adding-a-callback.md", 2), {"__name__": "worker"})
     assert "my_package.callbacks.GradientNorm" in CALLBACKS.targets
+    assert not started  # a process of hydra/launcher=joblib imports the script
+    exec(documented("adding-a-callback.md", 2), {"__name__": "__main__"})
+    assert started == ["train"]
