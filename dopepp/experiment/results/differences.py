@@ -202,12 +202,17 @@ def notes(entries: Sequence[Entry], values: Sequence[Value]) -> list[str]:
         sentences += _baseline_notes(measured[0], networks[1:] or measured[1:], noise_notes(values))
     if len(measured) > len(networks) > 1:
         sentences.append(REFINED_NOTE)
+    return [*sentences, *width_notes(entries)]
+
+
+def width_notes(entries: Sequence[Entry]) -> list[str]:
+    """Return a sentence about the widths of narrowed networks, if there are any."""
     models = [run.config.get("model") for entry in entries for run in entry.runs]
     widths = {float(model.get("width", 1.0)) for model in models if isinstance(model, dict)}
     if factors := ", ".join(f"{width:g}" for width in sorted(widths - {1.0})):
         narrowed = f"The networks were narrowed by model.width={factors}"
-        sentences.append(f"{narrowed}; costs are of the narrowed networks.")
-    return sentences
+        return [f"{narrowed}; costs are of the narrowed networks."]
+    return []
 
 
 def _baseline_notes(

@@ -27,7 +27,12 @@ from dopepp.experiment.results import display
 from dopepp.experiment.results.compared_runs import Entry
 from dopepp.experiment.results.conditions import SHADING
 from dopepp.experiment.results.cost import FRAMES_FILE, NOTE, save_frame_rates
-from dopepp.experiment.results.differences import REFINED_NOTE, comparison_values, noise_notes
+from dopepp.experiment.results.differences import (
+    REFINED_NOTE,
+    comparison_values,
+    noise_notes,
+    width_notes,
+)
 from dopepp.experiment.results.folder import COST_FILE, read_json
 from dopepp.experiment.results.frame import (
     ADD_5CM,
@@ -147,6 +152,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
         notes += [NOTE] if table.kind == "time" else []
     if not table.paper:
         notes.append("The paper has no table of these values.")
+    notes += width_notes(entries)
     rows, doubts = KINDS[table.kind](table, table.methods(entries), folder)
     display.show_table(title, rows, num_labels=sum(key in _LABELS for key in rows[0]))
     write_csv(folder / TABLE_FILE, rows, header_of(rows))
