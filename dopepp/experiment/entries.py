@@ -196,7 +196,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     except KeyboardInterrupt:
         if not multirun.is_remote(hydra):
             # Hydra skips the callback CompareJobs, so the finished jobs are compared here.
-            multirun.compare_jobs(Path(hydra.sweep.dir), config)
+            multirun.compare_jobs(Path(hydra.sweep.dir), config, interrupted=True)
         raise
     except PrunedError as end:
         display.console.print(f"pruned {end}")

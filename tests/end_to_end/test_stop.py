@@ -109,11 +109,15 @@ def test_an_interrupted_sweep_keeps_what_is_finished(call, tiny, tmp_path):
     assert rows[0]["instances"] == "3"
     assert rows[1]["object"].startswith("failed: unfinished")
     assert not (sweep / "2").exists()
+    advice = f"To continue, add `hydra.sweep.dir={sweep}` to this command."
+    readme = (sweep / "README.md").read_text()
+    assert readme.startswith("# Multirun: interrupted\n")
+    assert advice in readme
 
     options = ("seed=1,2,3", f"output_dir={tmp_path}", f"hydra.sweep.dir={sweep}")
     call("train.py", "-m", *tiny, *options, code=0)  # the page's way to continue
-    rows = read_csv(sweep / "compare.csv")
-    assert [row["seeds"] for row in rows[:1]] == ["1, 2, 3"]
+    assert read_csv(sweep / "compare.csv")[0]["seeds"] == "1, 2, 3"
+    assert (sweep / "README.md").read_text().startswith("# Multirun: finished\n")
 
 
 @pytest.fixture

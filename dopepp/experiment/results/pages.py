@@ -197,7 +197,9 @@ def _result_table(name: str, rows: Sequence[PoseRow]) -> str:
     )
 
 
-def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, str]) -> None:
+def write_multirun_readme(
+    folder: Path, command: Sequence[str], jobs: Mapping[str, str], interrupted: bool = False
+) -> None:
     """Write the README of a multirun with the state of each job, by folder; empty until the end."""
     rows = [{"job": f"[{job}]({job}/)", "state": state} for job, state in jobs.items()]
     with best_effort(str(folder / README_FILE)):
@@ -208,6 +210,8 @@ def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[st
             has_table=(folder / "compare.md").is_file(),
             has_image=(folder / "compare.png").is_file(),
             jobs=markdown(rows) if rows else "",
+            interrupted=interrupted,
+            folder=folder,
         )
 
 

@@ -77,7 +77,7 @@ class CheckJobs(Callback):
             raise SystemExit(1)
 
 
-def compare_jobs(folder: Path, config: DictConfig) -> bool:
+def compare_jobs(folder: Path, config: DictConfig, interrupted: bool = False) -> bool:
     """Write the comparison of a multirun's jobs; return whether each has finished or was pruned."""
     from dopepp.experiment.results import display
     from dopepp.experiment.results.compare import compare_runs
@@ -94,8 +94,11 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
     if table is not None:
         write_paper_table(PaperTable.of(table), entries, folder)
     log_comparison(_node(config, "logger"), folder)
-    write_multirun_readme(folder, program.command(), {job.name: _state(job) for job in jobs})
+    states = {job.name: _state(job) for job in jobs}
+    write_multirun_readme(folder, program.command(), states, interrupted)
     display.console.print(f"comparison in {folder}")
+    if interrupted:
+        display.console.print(f"to continue, add hydra.sweep.dir={folder} to the command")
     return not any(entry.failure and not entry.pruned for entry in entries)
 
 
