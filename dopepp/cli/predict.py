@@ -89,6 +89,7 @@ def predict(
     with interruptible("the written files are complete"):
         from dopepp.cli.outputs import BopCsv, JsonLines, Outputs, OverlayFolder
         from dopepp.cli.predict_scene import predict_scene, track_scene
+        from dopepp.drawing.pictures import photo_size
         from dopepp.geometry.camera import camera_matrix
         from dopepp.inference.frames import open_sources
         from dopepp.inference.frames.source import choose_camera, given_camera
@@ -130,8 +131,7 @@ def predict(
         cameras = [] if views else [choose_camera(K, camera, opened) for opened in sources]
         for opened, its_camera in zip(sources, cameras, strict=False):
             if opened.rate is None:  # refuse K of another image size before the model is loaded
-                first = next(opened.frames()).image
-                its_camera.for_picture((first.shape[1], first.shape[0]), K_size, crop)
+                its_camera.for_picture(photo_size(Path(opened.name)), K_size, crop)
 
         from dopepp.parts.catalogue import with_meshes
 
@@ -198,7 +198,11 @@ def _predict_source(
     for number, result in enumerate(results, 1):
         reason = ""
         if not result.detections and source.rate is None and not options["track"]:
-            result, reason = _search_again(estimator, camera, options, result)
+            from dopepp.inference.network_estimator import search_again
+
+            result, reason = search_again(estimator, camera, result, **options)
+            if result.detections:
+                typer.echo("nothing detected at the trained sizes; searched at all sizes", err=True)
         if verification is not None:
             agreements = [verification(result, detection) for detection in result.detections]
             result = replace(result, agreements=agreements)
@@ -226,31 +230,3 @@ def _verification(parts: Sequence[Part]) -> Verification:
         return agreement(result.image, result.K, detection.T_cam_obj, surface)
 
     return verify
-
-
-def _search_again(
-    estimator: PoseEstimator, camera: Camera, options: StreamOptions, result: PoseResult
-) -> tuple[PoseResult, str]:
-    """Search for parts at all distances in an image without detections.
-
-    Returns:
-        The new result, and why it has no detections (an empty string if it has any).
-    """
-    from dopepp.inference.network_estimator import NetworkEstimator
-
-    if not isinstance(estimator, NetworkEstimator):
-        return result, "no pose at these distances passes the verification"
-    from dopepp.inference.frames.source import Lens
-    from dopepp.recovery.reasons import format_reasons
-
-    image, K, depth = result.image, result.K, options["depth"]
-    metres = None if depth is None else Lens(camera).read_depth(depth, options["depth_scale"], K)
-    region = options["roi"], options["crop"] is not None
-    if options["distances"] is None:
-        candidates = estimator.candidates(image, K, None, metres, "any", *region)
-        detections, weaker = estimator.split(candidates)
-        if detections:
-            typer.echo("nothing detected at the trained sizes; searched at all sizes", err=True)
-            return replace(result, detections=detections, weaker=weaker), ""
-    reason = estimator.explain(image, K, metres, options["distances"], *region)
-    return result, format_reasons(reason)

@@ -214,6 +214,22 @@ def read_photo(path: Path) -> RGBImage:
     return np.ascontiguousarray(pixels[..., :3])
 
 
+def photo_size(path: Path) -> Size:
+    """Return the size of :func:`read_photo`'s image from the header of the file.
+
+    Raises:
+        UserError: As for :func:`read_photo`, if the header is damaged.
+    """
+    try:
+        image = _open(read_content(path), FORMATS)
+        # Pillow states the size of a TIFF file after its rotation.
+        is_turned = image.format != "TIFF" and image.getexif().get(ExifTags.Base.Orientation, 1) > 4
+    except Exception:  # PIL raises many types for damaged files; read_photo names the damage
+        height, width, _ = read_photo(path).shape
+        return width, height
+    return image.size[::-1] if is_turned else image.size
+
+
 def _open(content: bytes, formats: tuple[str, ...]) -> Image.Image:
     """Open an image without decoding; raise a ``ValueError`` for a damaged or unknown file."""
     damage = "" if content else "an empty file"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import torch
@@ -19,11 +19,14 @@ from dopepp.inference.network_input import NetworkView, merge_scales, network_vi
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import CANDIDATE, PROBABLE, Detection, RecoveryOptions
-from dopepp.recovery.reasons import Reason
+from dopepp.recovery.reasons import Reason, format_reasons
 from dopepp.recovery.recover import explain, recover
 
 if TYPE_CHECKING:
+    from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.pose_result import PoseResult
     from dopepp.inference.refinement.refiner import Refine
+    from dopepp.inference.stream import StreamOptions
 
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
@@ -164,3 +167,27 @@ class NetworkEstimator(PoseEstimator):
         """Return the options of the recovery; with refinement, the threshold is `CANDIDATE`."""
         threshold = min_score if self.refiner is None else CANDIDATE
         return vars(replace(self.recovery, min_score=threshold))
+
+
+def search_again(
+    estimator: PoseEstimator, camera: Camera, result: PoseResult, **options: Unpack[StreamOptions]
+) -> tuple[PoseResult, str]:
+    """Search for parts at all distances in an image of a stream without detections.
+
+    Returns:
+        The new result, and why it has no detections (an empty string if it has any).
+    """
+    if not isinstance(estimator, NetworkEstimator):
+        return result, "no pose at these distances passes the verification"
+    from dopepp.inference.frames.source import Lens  # the sources are slow to import
+
+    image, K, distances = result.image, result.K, options.get("distances")
+    path, scale = options.get("depth"), options.get("depth_scale", 0.001)
+    depth = None if path is None else Lens(camera).read_depth(path, scale, K)
+    region = options.get("roi"), options.get("crop") is not None
+    if distances is None:
+        candidates = estimator.candidates(image, K, None, depth, "any", *region)
+        detections, weaker = estimator.split(candidates)
+        if detections:
+            return replace(result, detections=detections, weaker=weaker), ""
+    return result, format_reasons(estimator.explain(image, K, depth, distances, *region))

@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -26,17 +27,16 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_file
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import RGBImage, read_photo
+from dopepp.drawing.pictures import RGBImage, photo_size
 from dopepp.drawing.sheet import belief_tiles, contact_sheet
 from dopepp.geometry.camera import MAX_VIEW_DEG, MIN_VIEW_DEG, CameraMatrix, camera_matrix
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.network_estimator import NetworkEstimator
-from dopepp.inference.pose_result import PoseResult, make_shape
+from dopepp.inference.frames.media import Images
+from dopepp.inference.network_estimator import NetworkEstimator, search_again
 from dopepp.parts.size import part_in_words
-from dopepp.recovery.reasons import format_reasons
 
 HOST: Final = "127.0.0.1"  # reachable from this machine only
 MAX_UPLOAD: Final = "64mb"  # size of an uncompressed image of 20 megapixels
@@ -165,23 +165,17 @@ def _outputs(
     estimator: PoseEstimator, path: Path, kind: str, inputs: Sequence[Any], folder: Path
 ) -> Outputs:
     """Estimate the poses on an uploaded image, and return the contents of the page's outputs."""
-    photo = read_photo(path)
-    size = (photo.shape[1], photo.shape[0])
-    camera = _camera(kind, inputs, *size).for_picture(size)
-    image, K = camera.undistorted(photo), camera.K
-    (detections, weaker), remark = estimator.split(estimator.candidates(image, K)), ""
-    if not detections and isinstance(estimator, NetworkEstimator):
-        detections, weaker = estimator.split(estimator.candidates(image, K, distances="any"))
-        remark = " (not at the trained sizes, but in a search at all sizes)"
-    if not detections and isinstance(estimator, NetworkEstimator):
-        remark = f": {format_reasons(estimator.explain(image, K))}"
-    shapes = {part.name: make_shape(part) for part in estimator.parts}
-    shared: dict[str, Any] = {"shapes": shapes, "weaker": weaker, "min_score": estimator.min_score}
-    result = PoseResult(image, K, detections, {}, path.name, **shared)
+    camera, remark = _camera(kind, inputs, *photo_size(path)), ""
+    (result,) = estimator.stream(Images([path]), camera=camera)
+    if not result.detections:
+        result, reason = search_again(estimator, camera, result)
+        beyond = " (not at the trained sizes, but in a search at all sizes)"
+        remark = f": {reason}" if reason else beyond
+    result = replace(result, name=path.name)
     file = Path(mkdtemp(dir=folder), f"{path.stem}.json")
     write_file(file, json.dumps(result.records(), ensure_ascii=False, indent=1).encode())
     rows: list[list[object]] = []
-    for detection in detections:
+    for detection in result.detections:
         position = [f"{mm:.1f}" for mm in 1000 * detection.T_cam_obj[:3, 3]]
         rotation = [f"{q:.3f}" for q in matrix_to_quaternion(detection.T_cam_obj[:3, :3])]
         error = f"{detection.reprojection_error_px:.1f}"
@@ -191,8 +185,10 @@ def _outputs(
     if scale < 1:
         area = cv2.INTER_AREA
         drawn = np.asarray(cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=area))
-    summary = _message(f"{result.summary}{remark}", is_error=not detections)
-    maps = belief_sheet(estimator, image, K) if isinstance(estimator, NetworkEstimator) else None
+    summary = _message(f"{result.summary}{remark}", is_error=not result.detections)
+    maps = None
+    if isinstance(estimator, NetworkEstimator):
+        maps = belief_sheet(estimator, result.image, result.K)
     return drawn, summary, rows, _button(file), maps
 
 

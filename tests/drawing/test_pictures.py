@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import read_image, read_photo, read_picture, read_rgb
+from dopepp.drawing.pictures import photo_size, read_image, read_photo, read_picture, read_rgb
 from dopepp.parts.mesh.obj import read_texture
 
 
@@ -88,6 +88,9 @@ def test_the_orientation_of_a_photo_agrees_with_opencv(tmp_path, image, orientat
     expected = cv2.imread(str(path))[..., ::-1]
     assert read_photo(path).shape == expected.shape
     np.testing.assert_allclose(read_photo(path).astype(int), expected.astype(int), atol=4)
+    for other in (tmp_path / f"photo{suffix}" for suffix in (".jpg", ".tiff", ".png", ".webp")):
+        Image.fromarray(image).save(other, exif=exif)
+        assert photo_size(other) == read_photo(other).shape[1::-1] == expected.shape[1::-1]
     np.testing.assert_array_equal(read_picture(path), read_photo(path))
     height, width = expected.shape[:2]
     assert read_picture(path, max(width, height) // 2).shape[:2] == (height // 2, width // 2)
@@ -140,5 +143,8 @@ def test_errors_about_photos_contain_a_fix(tmp_path, image, name, fix):
     cv2.imwrite(str(tmp_path / "raw.png"), 16 * image[..., 0].astype(np.uint16))
     cv2.imwrite(str(tmp_path / "colours.png"), 16 * image.astype(np.uint16))
     (tmp_path / "text.png").write_text("no image")
-    with pytest.raises(UserError, match=f"{name}.*{fix}"):
-        read_photo(tmp_path / name)
+    for read in (read_photo, photo_size)[
+        : 1 + (name in ("several.gif", "text.png", "missing.png"))
+    ]:
+        with pytest.raises(UserError, match=f"{name}.*{fix}"):
+            read(tmp_path / name)
