@@ -13,7 +13,7 @@ from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from dopepp.core.errors import RunError, UserError, system_failure
+from dopepp.core.errors import RunError, UserError, system_failure, uninterrupted
 from dopepp.core.files import IMAGES, check_target, partial_path
 
 if TYPE_CHECKING:
@@ -38,7 +38,10 @@ class Output(Protocol):
 
 
 class Outputs:
-    """Group of (path, output) pairs for a ``with`` block; an OSError becomes a RunError."""
+    """Group of (path, output) pairs for a ``with`` block; an OSError becomes a RunError.
+
+    An interruption is postponed until all outputs have the result.
+    """
 
     def __init__(self, outputs: Sequence[tuple[Path, Output]]) -> None:
         self._outputs = outputs
@@ -52,15 +55,16 @@ class Outputs:
         self._each(lambda output: output.write(result))
 
     def _each(self, action: Callable[[Output], None]) -> None:
-        for path, output in self._outputs:
-            with _disk_errors(path):
-                action(output)
+        with uninterrupted():
+            for path, output in self._outputs:
+                with _disk_errors(path):
+                    action(output)
 
     def __enter__(self) -> Outputs:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with ExitStack() as stack:
+        with uninterrupted(), ExitStack() as stack:
             for path, output in self._outputs:
                 stack.enter_context(_disk_errors(path))
                 stack.callback(output.close)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import signal
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
@@ -97,10 +97,27 @@ def interruptible(advice: str = RESUME) -> Iterator[None]:
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
         raise Interruption(number, advice)
 
+    with _handled_by(interrupt):
+        yield
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Postpone SIGINT and SIGTERM to the end of the block (main thread)."""
+    numbers: list[int] = []
+    with _handled_by(lambda number, _: numbers.append(number)):
+        yield
+    for number in numbers:
+        signal.raise_signal(number)
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Pass SIGINT and SIGTERM in the block to a handler."""
     numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = {number: signal.signal(number, interrupt) for number in numbers}
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, earlier in previous.items():
+            signal.signal(number, earlier)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dopepp.cli.outputs import Outputs
+from dopepp.cli.outputs import JsonLines
 from dopepp.data.formats.bop.bop_results import read_results
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
@@ -97,15 +97,15 @@ def test_an_image_without_the_part_has_an_empty_line(predict, files, tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interruptions_keep_the_written_files(predict, files, tmp_path, monkeypatch, number, code):
-    write, written = Outputs.write, []
+    write, written = JsonLines.write, []
 
     def interrupted(self, result):
-        write(self, result)
         written.append(result)
-        if len(written) == 3:
+        if len(written) == 3:  # the image is written, the lines of JSON and CSV are not
             os.kill(os.getpid(), number)
+        write(self, result)
 
-    monkeypatch.setattr(Outputs, "write", interrupted)
+    monkeypatch.setattr(JsonLines, "write", interrupted)
     out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
     done = predict(files / "clip.avi", "--save", out, "--json", poses, "--csv", csv, code=code)
     assert done.stderr.splitlines()[-1] == "interrupted; the written files are complete"
