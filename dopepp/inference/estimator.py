@@ -446,10 +446,10 @@ class PoseEstimator(ABC):
             UserError: The estimator was loaded without refinement by region, an argument is
                 invalid, or the numbers of images, cameras and poses differ.
         """
-        from dopepp.inference import several_views
+        from dopepp.inference.several_views import joint_estimator, search
 
-        given = images, cameras, T_world_cam, depths, distances, camera_error, names
-        return several_views.predict_views(self, *given)
+        given = images, cameras, T_world_cam, depths, camera_error, names
+        return search(self, joint_estimator(self, *given), distances)
 
     def explain(
         self,

@@ -48,21 +48,6 @@ CAMERA_ERROR: Final = (2e-4, math.radians(0.02))
 each axis (radians). These errors are typical after a hand-eye calibration."""
 
 
-def predict_views(
-    estimator: PoseEstimator,
-    images: Sequence[RGBImage],
-    cameras: Sequence[Camera | CameraMatrix],
-    T_world_cam: Sequence[Transform],
-    depths: Sequence[Depth] | None = None,
-    distances: Distances | None = None,
-    camera_error: tuple[float, float] | None = None,
-    names: Sequence[str] | None = None,
-) -> ViewsResult:
-    """Estimate the poses of parts on several images; see :meth:`PoseEstimator.predict_views`."""
-    given = images, cameras, T_world_cam, depths, camera_error, names
-    return search(estimator, joint_estimator(estimator, *given), distances)
-
-
 def joint_estimator(
     estimator: PoseEstimator,
     images: Sequence[RGBImage],
