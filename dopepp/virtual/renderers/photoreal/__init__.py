@@ -14,14 +14,12 @@ Environment variables:
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import multiprocessing
 import os
 import re
 import subprocess
 import sys
-from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
@@ -29,7 +27,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dopepp.core.errors import UserError, require
-from dopepp.core.files import cache_folder, write_file
+from dopepp.core.json import cached
 from dopepp.core.pool import available_cores
 
 _log = logging.getLogger(__name__)
@@ -144,28 +142,24 @@ def candidates() -> list[Path]:
 
 def is_usable(library: Path) -> bool:
     """Return whether a trial process could render with a libLLVM; the outcome is cached."""
+
+    def works() -> bool:
+        trial = subprocess.run(
+            [sys.executable, "-c", _TRIAL],
+            env={**os.environ, LIBRARY_SETTING: str(library)},
+            capture_output=True,
+            text=True,
+            timeout=60.0,
+        )
+        usable = trial.returncode == 0 and "mean" in trial.stdout
+        _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
+        return usable
+
     try:
         stat = library.stat()
-    except OSError:
-        return False
-    key = f"{library} {stat.st_mtime_ns} {stat.st_size} {version('mitsuba')} {version('drjit')}"
-    cached = cache_folder() / f"libllvm_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-    with suppress(OSError, ValueError, KeyError):  # not tried yet, or the file is damaged
-        return {"works": True, "fails": False}[cached.read_text("utf-8")]
-    command = [sys.executable, "-c", _TRIAL]
-    environment = {**os.environ, LIBRARY_SETTING: str(library)}
-    try:
-        trial = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=60.0
-        )
+        versions = version("mitsuba"), version("drjit")
+        key = (str(library), stat.st_mtime_ns, stat.st_size, *versions)
+        return cached("libllvm", key, bool, works)
     except (OSError, subprocess.TimeoutExpired) as error:
         _log.warning("%s could not be tested: %s", library, error)
         return False
-    usable = trial.returncode == 0 and "mean" in trial.stdout
-    _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
-    try:
-        write_file(cached, b"works" if usable else b"fails")
-    except OSError as error:
-        message = "%s cannot be written, so the next process tests libLLVM again: %s"
-        _log.warning(message, cached, error)
-    return usable

@@ -68,12 +68,12 @@ def test_the_outcome_is_cached_until_the_library_changes(library, monkeypatch, t
     commands = stand_in(monkeypatch, "print('mean', 0.5)")
     assert [variant.is_usable(library) for _ in range(2)] == [True, True]
     assert len(commands) == 1
-    (cached,) = (tmp_path / "cache" / "dopepp").iterdir()
-    for count, damage in enumerate((b"", b"wor", b"\xff" * 1000), start=2):
+    (cached,) = (tmp_path / "cache" / "dopepp" / "libllvm").iterdir()
+    for count, damage in enumerate((b"", b"tru", b"\xff" * 1000), start=2):
         cached.write_bytes(damage)  # a damaged file is written again
         assert variant.is_usable(library)
         assert len(commands) == count
-        assert cached.read_text() == "works"
+        assert cached.read_text() == "true"
     os.utime(library, (1, 1))
     assert variant.is_usable(library)
     assert len(commands) == 5
