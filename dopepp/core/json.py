@@ -90,15 +90,16 @@ def parse_json(text: str | bytes, where: str) -> object:
         raise _bad(where, str(error)) from error
 
 
-def cached(folder: str, key: tuple[object, ...], kind: type[T], make: Callable[[], T]) -> T:
-    """Return a JSON value from a folder of the user's cache, under a hash of ``key``.
+def cached(folder: str, key: tuple[object, ...], kind: Any, make: Callable[[], T]) -> T:
+    """Return a JSON value of type ``kind`` from a folder of the user's cache, by a hash of ``key``.
 
     A missing or damaged file is written again. If that fails, a warning is logged.
     """
     name = f"{hashlib.sha256(repr(key).encode()).hexdigest()[:32]}.json"
     path = cache_folder() / folder / name
     try:
-        return parse(kind, read_json(path))
+        stored: T = parse(kind, read_json(path))
+        return stored
     except (OSError, UserError):
         value = make()
     try:

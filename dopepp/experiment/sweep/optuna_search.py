@@ -289,7 +289,7 @@ def open_study(options: Search, facts: Mapping[str, str], seed: int) -> optuna.S
     study = optuna.create_study(
         storage=open_storage(options.storage),
         study_name=name,
-        direction=f"{options.mode}imize",
+        direction="maximize" if options.mode == "max" else "minimize",
         load_if_exists=True,
     )
     begun_with = study.user_attrs.get(_FACTS)
