@@ -30,7 +30,7 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 from dopepp.core.errors import UserError, require
 
@@ -97,6 +97,35 @@ def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) ->
         return [function(item) for item in items]
     with ThreadPoolExecutor(min(len(items), count), THREAD_PREFIX) as threads:
         return list(threads.map(function, items))
+
+
+def in_forked_process(function: Callable[[Item], Result], item: Item) -> Result:
+    """Return a function's result, computed in a process whose threads and libraries end with it.
+
+    Raises:
+        LostWorkerError: The process died.
+    """
+    context = get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def work() -> None:
+        try:
+            sender.send((function(item), None))
+        except Exception as error:
+            sender.send((None, error))
+
+    process = context.Process(target=work)
+    process.start()
+    sender.close()
+    try:
+        result, error = receiver.recv()
+    except EOFError:
+        raise LostWorkerError(f"the process of {function.__name__} died") from None
+    finally:
+        process.join()
+    if error is not None:
+        raise error
+    return cast("Result", result)
 
 
 def cpu_fact(*names: str) -> str:

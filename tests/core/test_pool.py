@@ -14,7 +14,14 @@ import pytest
 
 from dopepp.core import pool as pool_module
 from dopepp.core.errors import UserError
-from dopepp.core.pool import ClusterPool, LostWorkerError, Pool, ProcessPool, map_in_threads
+from dopepp.core.pool import (
+    ClusterPool,
+    LostWorkerError,
+    Pool,
+    ProcessPool,
+    in_forked_process,
+    map_in_threads,
+)
 
 
 def wait_for_group(process: int) -> None:
@@ -195,3 +202,16 @@ def test_results_of_threads_are_in_the_order_of_the_items(threads, monkeypatch):
     )
     assert [len(identities) for identities in nested] == [1, 1]
     assert map_in_threads(str, []) == []
+
+
+def test_a_forked_process_returns_or_raises_what_its_function_does():
+    parent = os.getpid()
+
+    def fail(message):
+        raise UserError(message, "nothing", "none")
+
+    assert in_forked_process(lambda item: (item, os.getpid() != parent), 3) == (3, True)
+    with pytest.raises(UserError, match="got this"):
+        in_forked_process(fail, "this")
+    with pytest.raises(LostWorkerError, match="died"):
+        in_forked_process(os._exit, 1)

@@ -22,6 +22,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from dopepp.core import extensions
 from dopepp.core.errors import Interruption, RunError, UserError
+from dopepp.core.pool import in_forked_process
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.build_parts import build_parts
@@ -53,6 +54,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import refine_terms
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Parts
+from dopepp.parts.size import LearnedRange
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.pose_validation import EarlyStop
 from dopepp.training.processes import ProcessDiedError, is_rank_zero
@@ -142,11 +144,18 @@ def _train(
     fingerprint = datamodule.fingerprint()
     sources = {"train": datamodule.train_source, "val": datamodule.val_source}
     sources["test"] = datamodule.test_source
-    images = {split: describe_images(source) for split, source in sources.items()}
+
+    def describe(parts: Parts) -> tuple[dict[str, Any], dict[str, LearnedRange]]:
+        images = {split: describe_images(source) for split, source in sources.items()}
+        return images, datamodule.size_ranges(parts)
+
+    # Mitsuba's threads in this process would not survive the fork of the loader's workers.
+    is_raster = config.data.virtual.renderer == "raster"
+    images, sizes = describe(parts) if is_raster else in_forked_process(describe, parts)
     newest = _newest_checkpoint(config)
     # The file with the initial weights of a resumed run may no longer exist.
     initial = config if newest is None else replace(config, init_from=None)
-    system = build_system(initial, parts, fingerprint, images, datamodule.size_ranges(parts))
+    system = build_system(initial, parts, fingerprint, images, sizes)
     changes = [] if newest is None else check_resume(run_dir, config, newest[1], system.payload)
     # Lightning may reject the options, so the trainer is built before anything is written.
     trainer = build_trainer(config, run_dir, trackers, _progress(config, datamodule))
