@@ -73,12 +73,15 @@ class Outputs:
 class OverlayFolder:
     """Output of images with drawn poses to a folder; videos and cameras become videos.
 
-    ``stride`` is the number of frames of a video from one result to the next.
+    ``stride`` is the number of frames of a video from one result to the next. The files of
+    ``sources`` are never overwritten.
     """
 
-    def __init__(self, folder: Path, stride: int = 1) -> None:
+    def __init__(self, folder: Path, sources: Sequence[FrameSource], stride: int = 1) -> None:
         check_target(folder / "picture.png")
         self._folder, self._stride = folder, stride
+        files = [path for source in sources for path in source.paths]
+        self._protected = {path.resolve() for path in files} | set(map(_resolve_folder, files))
         self._names: set[str] = set()
         self._source: FrameSource | None = None
         self._video: VideoFile | None = None
@@ -94,12 +97,12 @@ class OverlayFolder:
         if result.time is None:
             path = Path(result.name)
             suffix = path.suffix if path.suffix.lower() in IMAGES else ".png"
-            result.save(self._new_path(path.stem, suffix, path))
+            result.save(self._new_path(path.stem, suffix))
             return
         if self._video is None:
             from dopepp.drawing.pictures import VideoFile
 
-            path = self._new_path(self._source.stem, ".mp4", Path(self._source.name))
+            path = self._new_path(self._source.stem, ".mp4")
             self._video = VideoFile(path, (self._source.rate or 1.0) / self._stride)
         self._video.write(result.plot(), result.time)
 
@@ -109,16 +112,16 @@ class OverlayFolder:
             video, self._video = self._video, None
             video.close()
 
-    def _new_path(self, stem: str, suffix: str, source: Path) -> Path:
-        """Return a path in the folder, numbered if its name was used; reject the source's path."""
+    def _new_path(self, stem: str, suffix: str) -> Path:
+        """Return a path in the folder, numbered if its name was used; reject a source's path."""
         name, number = f"{stem}{suffix}", 1
         while name in self._names:
             number += 1
             name = f"{stem}_{number}{suffix}"
         self._names.add(name)
         path = self._folder / name
-        if path.exists() and source.exists() and path.samefile(source):
-            problem = f"--save {self._folder}, which is the folder of {source}"
+        if _resolve_folder(path) in self._protected:
+            problem = f"--save {self._folder}, which is the folder of {path}"
             fix = "pass another folder, e.g. --save poses"
             raise UserError(problem, "a folder without the sources", fix)
         return path
@@ -184,6 +187,11 @@ class BopCsv:
             from dopepp.data.formats.bop.bop_results import write_results
 
             write_results(self._path, self._rows)
+
+
+def _resolve_folder(path: Path) -> Path:
+    """Return a path without symbolic links in its folder; the file itself may be a link."""
+    return path.parent.resolve() / path.name
 
 
 @contextmanager

@@ -118,15 +118,15 @@ def predict(
                 allowed = f"{option} with --refine region, its default"
                 raise UserError(f"{option} with --refine {refine}", allowed, "leave out --refine")
             terms = ("region",)
+        words = [[word] for word in source] if track and views else [source]  # one for each camera
+        sources = [opened for group in words for opened in open_sources(group, topic)]
         outputs: list[tuple[Path, Any]] = []
         if save is not None:
-            outputs.append((save, OverlayFolder(save, stride)))
+            outputs.append((save, OverlayFolder(save, sources, stride)))
         if json_file is not None:
             outputs.append((json_file, JsonLines(json_file)))
         if csv is not None:
             outputs.append((csv, BopCsv(csv)))
-        words = [[word] for word in source] if track and views else [source]  # one for each camera
-        sources = [opened for group in words for opened in open_sources(group, topic)]
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         cameras = [] if views else [choose_camera(K, camera, opened) for opened in sources]
         for opened, its_camera in zip(sources, cameras, strict=False):

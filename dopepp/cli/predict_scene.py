@@ -102,7 +102,8 @@ def track_scene(
             assert save is not None
             stem = source.stem if source.rate else Path(source.name).absolute().parent.name
             folder = save / f"{number}_{stem}"
-            drawn.append(files.enter_context(Outputs([(folder, OverlayFolder(folder))])))
+            overlays = OverlayFolder(folder, sources)
+            drawn.append(files.enter_context(Outputs([(folder, overlays)])))
             drawn[-1].begin(source)
         for number, frames in enumerate(zip_longest(*(source.frames() for source in sources)), 1):
             if None in frames:  # a video whose header states more frames

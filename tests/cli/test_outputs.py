@@ -140,6 +140,20 @@ def test_overlays_do_not_overwrite_their_images(predict, files):
     assert (files / "000007.jpg").read_bytes() == before
 
 
+@pytest.mark.parametrize("linked", [False, True])
+def test_overlays_do_not_overwrite_images_of_later_sources(predict, files, tmp_path, linked):
+    image = (files / "000007.jpg").read_bytes()
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "1.jpg").write_bytes(image)
+    if linked:
+        (tmp_path / "link").symlink_to(tmp_path / "right")
+    right = tmp_path / ("link" if linked else "right")
+    done = predict(tmp_path / "left", tmp_path / "right", "--save", right, code=2)
+    assert f"the folder of {right}/1.jpg" in done.stderr.splitlines()[-1]
+    assert (tmp_path / "right" / "1.jpg").read_bytes() == image
+
+
 def test_equal_names_are_numbered(predict, files, tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "000007.jpg").write_bytes((files / "000007.jpg").read_bytes())

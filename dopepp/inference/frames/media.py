@@ -49,7 +49,7 @@ class Images(FrameSource):
     """Frame source of image files, in the order of ``paths``."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths = paths
+        self.paths = paths
         self.name, self.stem, self.count = str(paths[0]), paths[0].stem, len(paths)
         numbers = [int(path.stem) if path.stem.isdecimal() else -1 for path in paths]
         are_unique = min(numbers) >= 0 and len(set(numbers)) == len(numbers)
@@ -61,7 +61,7 @@ class Images(FrameSource):
         Raises:
             UserError: An image is damaged.
         """
-        for number, path in list(zip(self._numbers, self._paths, strict=True))[::stride]:
+        for number, path in list(zip(self._numbers, self.paths, strict=True))[::stride]:
             yield CameraFrame(read_photo(path), str(path), number)
 
 
@@ -102,6 +102,7 @@ class Video(FrameSource):
 
     def __init__(self, path: Path) -> None:
         self._path, self.name, self.stem = path, str(path), path.stem
+        self.paths = (path,)
         try:
             with path.open("rb") as file:
                 header = file.read(16)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +32,7 @@ class FrameSource(ABC):
     stem: str  # file name without suffix for outputs about this source
     count: int | None = None  # number of frames; None if unknown
     rate: float | None = None  # frames per second; None for separate images
+    paths: Sequence[Path] = ()  # files with the images
     is_live: bool = False  # whether frames are lost while nobody reads them
 
     @property
