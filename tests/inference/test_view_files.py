@@ -1,6 +1,7 @@
 """Files of camera poses in three formats, written here by independent code."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,3 +122,26 @@ def test_a_colmap_model_has_camera_poses(tmp_path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 4 a.png\n\n")
     with pytest.raises(UserError, match="CAMERA_ID"):
         read_camera_poses(tmp_path / "images.txt")
+
+
+def test_images_of_one_name_have_the_poses_of_their_folders(tmp_path):
+    (tmp_path / "cameras.txt").write_text("3 PINHOLE 640 480 600 601 320 240\n")
+    path = tmp_path / "images.txt"
+    path.write_text("1 1 0 0 0 0 0 0 3 left/1.png\n\n2 1 0 0 0 -2 0 0 3 right/1.png\n\n")
+    poses = read_camera_poses(path)
+    shifts = [poses.of(Path("rig", side, "1.png")).T_world_cam[0, 3] for side in ("left", "right")]
+    assert shifts == [0, 2]
+    with pytest.raises(UserError, match="without a camera pose for 1"):
+        poses.of(tmp_path / "1.png")
+    path.write_text("1 1 0 0 0 0 0 0 3 left/0.png\n\n2 1 0 0 0 -2 0 0 3 right/1.png\n\n")
+    with pytest.raises(UserError, match="without a camera pose for 1"):
+        read_camera_poses(path).of(tmp_path / "left" / "1.png")
+
+
+def test_cameras_with_numbers_as_names_have_the_poses_of_their_folders(tmp_path):
+    views = {"0": {"T_world_cam": FORMS[0]}, "1": {"T_world_cam": {"matrix": np.eye(4).tolist()}}}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump({"views": views}))
+    poses = read_camera_poses(tmp_path / "rig.yaml")
+    for name in ("0001.png", "0.png"):
+        assert_allclose(poses.of(tmp_path / "1" / name).T_world_cam, np.eye(4))
+        assert_allclose(poses.of(tmp_path / "0" / name).T_world_cam, T_WORLD_CAM, atol=1e-12)

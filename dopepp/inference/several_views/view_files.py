@@ -48,18 +48,28 @@ class CameraPose:
 class CameraPoses:
     """Camera poses and calibrations of several images, from a file."""
 
-    poses: Mapping[str, CameraPose]  # by the image's name without folder (BOP: by its number)
+    poses: Mapping[str, CameraPose]  # by name of an image, with or without folders, or of a folder
     error: tuple[float, float] | None  # deviations, metres and radians; None if the file has none
     source: str  # path of the file
+    are_numbered: bool = False  # whether ``poses`` has the numbers of images in place of names
 
     def of(self, image: Path) -> CameraPose:
-        """Return the camera of an image, looked up by the image's name, number or folder.
+        """Return the camera of an image, looked up by the image's name, folder or number.
+
+        The file may name images with folders. A pose of an image in another folder counts if it is
+        the only pose of this name, and the file has no image of the given folder.
 
         Raises:
             UserError: The file has no pose of the image.
         """
+        parts = image.absolute().parts
+        by_name = ["/".join(parts[start:]) for start in range(1, len(parts))]
+        named = [name for name in self.poses if Path(name).name == image.name]
+        if len(named) == 1 and all(Path(name).parent.name != parts[-2] for name in self.poses):
+            by_name += named
+        by_name += [image.parent.name, image.stem]
         number = image.stem.lstrip("0") or "0"
-        for name in (image.name, image.stem, number, image.parent.name):
+        for name in [number] if self.are_numbered else by_name:
             if name in self.poses:
                 return self.poses[name]
         names = ", ".join(list(self.poses)[:5]) + ", …" * (len(self.poses) > 5)
@@ -122,7 +132,7 @@ def _bop(path: Path) -> CameraPoses:
         T_cam_world = parse_transform({"matrix": make_transform(R, t)}, where)
         camera = camera_of_fields({"cam_K": record.get("cam_K")}, where)
         poses[name] = CameraPose(invert_transform(T_cam_world), camera)
-    return CameraPoses(poses, None, str(path))
+    return CameraPoses(poses, None, str(path), are_numbered=True)
 
 
 def _colmap(path: Path) -> CameraPoses:
@@ -144,8 +154,7 @@ def _colmap(path: Path) -> CameraPoses:
             raise UserError(f"{path}: {line:.100}", allowed, "export the model as text again")
         fields = {"quaternion_wxyz": words[1:5], "position": words[5:8]}
         T_cam_world = parse_transform(fields, f"{path}: {words[9]}")
-        name = Path(words[9]).name
-        poses[name] = CameraPose(invert_transform(T_cam_world), cameras[words[8]])
+        poses[words[9]] = CameraPose(invert_transform(T_cam_world), cameras[words[8]])
     return CameraPoses(poses, None, str(path))
 
 
