@@ -91,7 +91,7 @@ def node(
         from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
         sources = open_sources(words, topics[0] if topic else None) if transport in LINES else []
-        cameras = [fixed_camera or choose_camera(None, None, opened) for opened in sources]
+        cameras = [choose_camera(None, fixed_camera, opened) for opened in sources]
         estimator = options.load_estimator(
             model, device, unit, working_distance, tilt, max_ms=max_ms, scale_error=scale_error
         )

@@ -140,7 +140,7 @@ class Bag(FrameSource):
             topics = [link for link in reader.connections if link.msgtype in (RAW, COMPRESSED)]
             self.topic = self._select(topics, topic)
             seconds = (reader.end_time - reader.start_time) / 1e9
-        self.name = f"{path} {self.topic}"
+        self.name, self.is_rectified = f"{path} {self.topic}", is_rectified(self.topic)
         self.count = sum(link.msgcount for link in topics if link.topic == self.topic)
         self.rate = max(1.0, (self.count - 1) / seconds) if seconds > 0 else 1.0
 
@@ -164,7 +164,7 @@ class Bag(FrameSource):
         """Camera of the images' ``camera_info``; None if the recording has none."""
         topic = info_topic(self.topic)
         for _, message in self._messages([topic], CAMERA):
-            return camera_of_info(message, f"{self._path} {topic}", is_rectified(self.topic))
+            return camera_of_info(message, f"{self._path} {topic}", self.is_rectified)
         return None
 
     def messages(self) -> Iterator[tuple[float, Any, Any | None]]:

@@ -28,11 +28,12 @@ class CameraFrame:
 class FrameSource(ABC):
     """Sequence of camera frames."""
 
-    name: str  # for messages and output files, without passwords
+    name: str  # for messages and output files, without passwords and tokens
     stem: str  # file name without suffix for outputs about this source
     count: int | None = None  # number of frames; None if unknown
     rate: float | None = None  # frames per second; None for separate images
     paths: Sequence[Path] = ()  # files with the images
+    is_rectified: bool = False  # whether the images have no lens distortion
     is_live: bool = False  # whether frames are lost while nobody reads them
 
     @property
@@ -82,15 +83,26 @@ def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> 
     return read_camera(camera) if isinstance(camera, Path | str) else camera
 
 
+def check_distortion(given: Camera | None, is_rectified: bool, name: str) -> None:
+    """Raise a UserError if the camera given for rectified images has distortion coefficients."""
+    if is_rectified and given is not None and given.distortion:
+        problem = f"{given.source} with distortion coefficients for the rectified images {name}"
+        fix = "leave out --camera if there is a camera_info, or pass --K or the raw images"
+        raise UserError(problem, "a camera without distortion", fix)
+
+
 def choose_camera(
     K: CameraMatrix | None, camera: Camera | Path | str | None, source: FrameSource
 ) -> Camera:
     """Return the camera that the user specified, or else the camera that the source describes.
 
     Raises:
-        UserError: As for :func:`given_camera`, or neither user nor source specifies a camera.
+        UserError: As for :func:`given_camera` and :func:`check_distortion`, or neither user nor
+            source specifies a camera.
     """
-    chosen = given_camera(K, camera) or source.camera
+    given = given_camera(K, camera)
+    check_distortion(given, source.is_rectified, source.name)
+    chosen = given or source.camera
     if chosen is None:
         fix = "pass --K fx fy cx cy (pixels of this image) or --camera FILE; in Python, K or camera"
         raise UserError(f"neither --K nor --camera for {source.name}", "--K or --camera", fix)

@@ -19,6 +19,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
 from dopepp.inference.frames.ros import camera_of_info, decode_image, is_cropped, is_rectified
+from dopepp.inference.frames.source import check_distortion
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
 from dopepp.inference.stream import FrameEstimator
@@ -186,6 +187,7 @@ class Worker:
         frame_id = self._checked_frame(message.header.frame_id, info, topic)
         try:
             source = f"camera_info of {topic}"
+            check_distortion(given, is_rectified(topic), topic)
             camera = given or camera_of_info(info, source, is_rectified(topic))
             check_size(camera, image)
         except UserError as error:

@@ -1,11 +1,15 @@
 """Images and cameras of ROS recordings that ``rosbags`` wrote."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera_file import Camera
 from dopepp.inference.frames import open_sources
+from dopepp.inference.frames.source import choose_camera
 
 pytest.importorskip("rosbags")
 from functools import partial
@@ -133,6 +137,10 @@ def test_rectified_images_have_the_camera_of_p(tmp_path):
         bag.image("/cam/image_rect_color", "rgb8", IMAGE)
     (source,) = open_sources([bag.path])
     assert (source.camera.K[0, 0], source.camera.distortion) == (500, ())
+    straight = Camera(None, source.camera.K, (), "a file")
+    assert choose_camera(None, straight, source) is straight
+    with pytest.raises(UserError, match="coefficients for the rectified images"):
+        choose_camera(None, replace(straight, distortion=(-0.1, 0.0, 0.0, 0.0)), source)
 
 
 def test_choice_among_several_topics_is_required(tmp_path):

@@ -82,6 +82,19 @@ def test_a_given_camera_replaces_camera_info(estimator, camera, messages, warnin
     assert not warnings
 
 
+def test_coefficients_for_rectified_images_are_one_warning(estimator, camera, messages, warnings):
+    rectified = "/camera/image_rect"
+    worker = Worker(estimator, camera=Camera((320, 240), camera.K, (-0.05, 0.01, 0, 0), "a file"))
+    for second in (1.0, 1.1):
+        assert (
+            worker.process(Shot(messages.image(camera.images[0], second), None, rectified)) is None
+        )
+    assert len(warnings) == 1
+    assert "got a file with distortion coefficients for the rectified images" in warnings[0]
+    worker = Worker(estimator, camera=Camera((320, 240), camera.K, (), "a file"))
+    assert worker.process(Shot(messages.image(camera.images[0], 1.0), None, rectified)) is not None
+
+
 def test_decreasing_stamps_are_one_warning(take, warnings):
     for second in (5, 6, 2, 3, 1):
         assert take(second=second) is not None
