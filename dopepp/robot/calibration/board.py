@@ -123,7 +123,17 @@ class Board:
         return page
 
     def write(self, path: Path) -> str:
-        """Write a PDF or PNG to print; return a text with the page's size and printing advice."""
+        """Write a PDF or PNG to print; return a text with the page's size and printing advice.
+
+        Raises:
+            UserError: The file cannot be written, or a length is not a number of whole pixels.
+        """
+        step = self.spacing / 2 if self.kind == "circles" else self.spacing
+        lengths_px = np.array([step, self.marker]) * 1000 * PX_PER_MM
+        if np.abs(lengths_px - np.rint(lengths_px)).max() > 1e-6:
+            lengths = " and ".join(f"{1000 * x:g} mm" for x in (self.spacing, self.marker) if x)
+            allowed = "lengths in tenths of a millimetre (circles: in fifths)"
+            raise UserError(f"a board with {lengths}", allowed, "round the lengths")
         check_target(path, (".pdf", ".png"))
         page, content, dpi = self.drawing(), io.BytesIO(), PX_PER_MM * 25.4
         kind = path.suffix[1:].upper()
@@ -206,6 +216,8 @@ def _violated_rule(board: Board) -> str:
         return f"a board of at most {LONGEST_MM} mm"
     if board.kind == "chess" and (board.columns + board.rows) % 2 == 0:
         return "one even and one odd number of corners, so that a half turn changes the board"
+    if board.kind == "circles" and board.rows % 2 == 0:
+        return "circles in an odd number of rows, so that a half turn changes the board"
     if board.kind != "charuco":
         return ""
     names = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]

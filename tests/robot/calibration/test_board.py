@@ -51,6 +51,15 @@ def test_a_printed_board_has_its_true_size(spec, tmp_path):
         assert np.allclose(np.array(image.size) / image.info["dpi"], inches, rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    "spec", ["charuco:8x6:20.55:15", "charuco:8x6:20:15.04", "chess:8x5:20.55", "circles:4x9:20.5"]
+)
+def test_a_size_that_cannot_be_drawn_is_not_printed(spec, tmp_path):
+    with pytest.raises(UserError, match="tenths of a millimetre"):
+        parse_board(spec).write(tmp_path / "board.pdf")
+    assert not list(tmp_path.iterdir())
+
+
 def test_squares_of_a_printed_charuco_board_have_the_stated_length():
     page = parse_board("charuco:8x6:20:15").drawing()
     assert page.shape == (6 * 200 + 200, 8 * 200 + 200)
@@ -72,6 +81,7 @@ def test_squares_of_a_printed_charuco_board_have_the_stated_length():
         ("chess:800x5:20", "at most 1200 mm"),
         ("chess:8x5:nan", "at least 1 mm"),
         ("circles:2x9:30", "at least 3×3"),
+        ("circles:4x10:40", "an odd number of rows"),
         ("rings:8x5:20", "charuco:COLUMNS"),
     ],
 )
