@@ -48,7 +48,7 @@ def predict(
         tuple[int, int, int, int] | None, Option(help="Region of interest: x y width height.")
     ] = None,
     conf: options.Conf = None,
-    stride: Annotated[int, Option(help="Use every n-th frame only.")] = 1,
+    stride: Annotated[int, Option(min=1, help="Use every n-th frame only.")] = 1,
     track: options.Track = False,
     refine: Annotated[
         str | None, Option(help="region, depth (with --depth), or region,depth.")
@@ -119,7 +119,9 @@ def predict(
                 raise UserError(f"{option} with --refine {refine}", allowed, "leave out --refine")
             terms = ("region",)
         words = [[word] for word in source] if track and views else [source]  # one for each camera
-        sources = [opened for group in words for opened in open_sources(group, topic)]
+        sources = [
+            opened for group in words for opened in open_sources(group, topic, csv is not None)
+        ]
         outputs: list[tuple[Path, Any]] = []
         if save is not None:
             outputs.append((save, OverlayFolder(save, sources, stride)))

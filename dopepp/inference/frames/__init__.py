@@ -30,10 +30,13 @@ SourceLike = str | Path | int | FrameSource
 an opened frame source."""
 
 
-def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> list[FrameSource]:
+def open_sources(
+    sources: Iterable[SourceLike], topic: str | None = None, by_folder: bool = False
+) -> list[FrameSource]:
     """Open frame sources in the given order. Consecutive image files form one sequence.
 
-    ``topic`` is the image topic of a ROS recording that has several.
+    ``topic`` is the image topic of a ROS recording that has several. With ``by_folder``, images of
+    different folders do not form one sequence.
 
     Raises:
         UserError: A file, camera or topic does not exist, a folder has no images, a video or
@@ -43,12 +46,15 @@ def open_sources(sources: Iterable[SourceLike], topic: str | None = None) -> lis
     image_paths: list[Path] = []
     for source in _resolve(sources):
         images = list_images(source) if isinstance(source, Path) else None
+        is_next = images is not None and not (
+            by_folder and image_paths and images[0].parent != image_paths[0].parent
+        )
+        if image_paths and not is_next:
+            opened.append(Images(image_paths))
+            image_paths = []
         if images is not None:
             image_paths += images
             continue
-        if image_paths:
-            opened.append(Images(image_paths))
-            image_paths = []
         if isinstance(source, FrameSource):
             opened.append(source)
         elif isinstance(source, Path):

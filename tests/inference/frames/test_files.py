@@ -50,6 +50,16 @@ def test_folder_pattern_and_list_of_files_are_one_sequence(folder):
     assert (source.count, source.rate) == (3, None)
 
 
+def test_sources_by_folder(folder, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    for number in (3, 4):
+        (other / f"{number}.png").write_bytes((folder / "frame2.png").read_bytes())
+    sources = open_sources([folder, f"{other}/*.png"], by_folder=True)
+    assert [source.name for source in sources] == [f"{folder}/frame0.png", f"{other}/3.png"]
+    assert [frame.number for frame in sources[1].frames()] == [3, 4]
+
+
 def test_frame_numbers_are_the_numbers_of_the_files(folder):
     for name in ("000007", "000012"):
         (folder / "frame0.png").with_stem(name).write_bytes((folder / "frame0.png").read_bytes())
