@@ -216,9 +216,11 @@ def _distribution(sweep: Override) -> distributions.BaseDistribution:
                 else distributions.FloatDistribution
             )
             return kind(low, high, log="log" in value.tags)
-        if isinstance(value, RangeSweep) and isinstance(value.step, int):
-            numbers = range(int(value.start or 0), int(value.stop or 0), value.step)
-            return distributions.IntDistribution(min(numbers), max(numbers), step=abs(value.step))
+        if isinstance(value, RangeSweep):
+            start, stop, step = value.start or 0, value.stop or 0, value.step
+            if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
+                numbers = range(start, stop, step)
+                return distributions.IntDistribution(min(numbers), max(numbers), step=abs(step))
         if sweep.is_discrete_sweep():
             return distributions.CategoricalDistribution(list(sweep.sweep_string_iterator()))
     except ValueError as error:

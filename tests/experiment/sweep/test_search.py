@@ -34,6 +34,7 @@ def loader():
         ("range(1, 10, 4)", IntDistribution(1, 9, step=4)),
         ("range(3)", IntDistribution(0, 2)),
         ("range(9, 0, -3)", IntDistribution(3, 9, step=3)),
+        ("range(0.5, 3.5)", CategoricalDistribution(["0.5", "1.5", "2.5"])),
         ("range(0.0, 0.5, 0.25)", CategoricalDistribution(["0.0", "0.25"])),
         ("choice(a, 3, true)", CategoricalDistribution(["a", "3", "True"])),
         ("a,b", CategoricalDistribution(["a", "b"])),
