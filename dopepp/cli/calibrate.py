@@ -246,11 +246,12 @@ def rig(
     calibration = calibrate_rig(boards, cameras)
     _show_rig(calibration)
     shift, rotation = calibration.deviations.max(axis=0)
+    axes = np.kron(np.eye(2), T_base_first[:3, :3])
     views = {
         name: {
             "camera": relpath(folder / f"{name}.yaml", out.parent),
             "T_world_cam": transform_record(T_base_first @ calibration.T_world_cam[number]),
-            "covariance": calibration.covariances[number].tolist(),
+            "covariance": (axes @ calibration.covariances[number] @ axes.T).tolist(),
             "error_px": float(calibration.errors_px[number]),
         }
         for number, name in enumerate(calibration.names)

@@ -206,6 +206,13 @@ def test_a_rig_is_calibrated_for_several_views(run, rig_folder, tmp_path):
     assert np.linalg.norm(T[:3, 3] - T_left_right[:3, 3]) < 0.001
     assert right.camera.size == (640, 480)
     assert 1e-6 < poses.error[0] < 1e-3
+    run("calibrate", "rig", folder, *words[:2], "--out", tmp_path / "left.yaml")
+    in_base, in_left = (
+        np.array(yaml.safe_load((tmp_path / name).read_text())["views"]["right"]["covariance"])
+        for name in ("rig.yaml", "left.yaml")
+    )
+    axes = np.kron(np.eye(2), T_base_left[:3, :3])
+    np.testing.assert_allclose(in_base, axes @ in_left @ axes.T, atol=1e-6 * in_left.max())
 
 
 def test_a_rig_is_not_trusted_if_its_hand_eye_file_is_not(refused, rig_folder, tmp_path):
