@@ -185,7 +185,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     measured = [entry for entry in methods.values() if entry.reports]
     objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
     if not objects:  # without measurements, show the paper's values and the reasons
-        objects = list(dict.fromkeys(name for row in layout.paper.values() for name in row))
+        objects = list(dict.fromkeys(name for row in layout.paper.values() for name in row)) or [""]
     rows = []
     for name in objects:
         for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):
@@ -264,7 +264,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
             if printed and measure == layout.pass_field:
                 numbers = {share: _number(value) for share, value in printed.items()}
                 rows.append({_METHOD: f"{label}, {_PAPER}", **head, **numbers})
-        panels[f"{name}: {heading(measure)}"] = rate_curves(_pooled(table), SHADING.per_unit)
+        panels[f"{name}: {heading(measure)}"] = rate_curves(pooled_rates(table), SHADING.per_unit)
     if panels:
         figure = rates_figure(panels, SHADING.axis, 2)
         write_png(folder / "table_shading.png", figure_image(figure))
@@ -300,11 +300,14 @@ def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
     return rates.assign(method=label)
 
 
-def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
-    """Yield the mean rate of each method and share, with Wilson's interval over all seeds."""
+def pooled_rates(rates: pd.DataFrame) -> Iterator[Value]:
+    """Yield the mean rate of each method and share, with Wilson's interval.
+
+    All seeds are measured on the same instances, which the interval counts once.
+    """
     for (method, share), seeds in rates.groupby(["method", "share"], sort=False):
         rate = float(seeds["rate"].mean())
-        low, high = interval(rate, int(seeds["num_instances"].sum()))
+        low, high = interval(rate, int(seeds["num_instances"].min()))
         yield Value(method, "", value=rate, condition=share, low=low, high=high)
 
 

@@ -5,13 +5,15 @@ The tables themselves are compared to the character in ``test_golden.py``.
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import read_csv
 from dopepp.experiment.results.compare import compare_paths
-from dopepp.experiment.results.paper import PaperTable
+from dopepp.experiment.results.frame import interval
+from dopepp.experiment.results.paper import PaperTable, pooled_rates
 from dopepp.experiment.sweep.multirun import CompareJobs
 from tests.experiment.conftest import report_of, write_run
 
@@ -107,3 +109,20 @@ def test_an_experiment_without_a_table_is_rejected_early(text, tmp_path):
     with pytest.raises(UserError, match="has no table layout"):
         compare_paths([tmp_path / "0"], tmp_path / "out", table=path)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_failed_runs_names_their_failures(tmp_path):
+    for number, model in enumerate(("dope", "dopepp")):
+        write_run(tmp_path / str(number), [f"model={model}"])
+    with pytest.raises(SystemExit):
+        end(tmp_path, {"title": "6", "labels": LABELS})
+    methods = [row["method"] for row in read_csv(tmp_path / "table.csv")]
+    assert methods == [f"{label}: unfinished: no metrics.json" for label in LABELS.values()]
+
+
+def test_the_interval_of_a_curve_counts_each_instance_once():
+    rates = pd.DataFrame(
+        {"method": "a", "share": 0.2, "seed": ["1", "2", "3"], "rate": 0.5, "num_instances": 40}
+    )
+    (value,) = pooled_rates(rates)
+    assert (value.low, value.high) == interval(0.5, 40)
