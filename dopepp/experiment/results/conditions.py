@@ -202,7 +202,8 @@ def measure_shading(
     """Measure every method with ``shares`` of the visible area of every instance covered.
 
     Instances are selected by the visible fraction before the shading, because heavily shaded
-    instances would otherwise be excluded. ``unmasked`` are the reports without shading.
+    instances would otherwise be excluded. ``unmasked`` are the reports without
+    shading, of these methods and perhaps others.
 
     Returns:
         The levels, beginning with 0, and the examples, image by image.
@@ -225,7 +226,7 @@ def measure_shading(
         num_shown = len(tiles) // (len(shares) + 1)
         if num_shown < min(num_examples, MAX_EXAMPLES) and any(counts):
             tiles += _examples(sample, shaded)
-    rows = {report.name: report.rows for report in unmasked}
+    rows = {report.name: report.rows for report in unmasked if report.name in methods}
     unshaded = Level(0.0, rows, {"share_reached": 0.0, "num_outside_tolerance": 0})
     return [unshaded, *(_shaded(share, metrics[share], reached[share]) for share in shares)], tiles
 

@@ -195,3 +195,12 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
     assert "Evaluated instances at ×20: none; at ×1: 3, " in caplog.text
     assert [tile.caption for tile in tiles] == [f"test/0/0, ×{scale}" for scale in ("0.5", 1, 20)]
     check_images(tmp_path, SCALE, 3)
+
+
+def test_reports_of_other_methods_are_left_out(tmp_path):
+    source = discs()
+    reports = measure(METHODS, [source.sample(0)], 0).reports
+    levels, _ = measure_shading({"dope": METHODS["dope"]}, source, SHARES, 1, reports)
+    assert [list(level.rows) for level in levels] == [["dope"]] * 4
+    record_condition(tmp_path, SHADING, levels, [], RATES)
+    assert {row["method"] for row in read_csv(tmp_path / "shading.csv")} == {"dope"}
