@@ -108,9 +108,14 @@ def check_poses(
         T_base_flange of the chosen poses, metres.
 
     Raises:
-        UserError: The robot or the board rotates by less than 5° between any two poses, or their
-            motions disagree. The message names conventions under which they agree, if any.
+        UserError: There is no pose, the robot or the board rotates by less than 5° between any two
+            poses, or their motions disagree. The message names conventions under which they agree,
+            if any.
     """
+    if not boards:
+        problem = f"{poses.source}: no pose has an image that shows the board"
+        fix = "compare the names in the file with those of the images"
+        raise UserError(problem, "poses of images that show the board", fix)
     B = np.stack([board.T_cam_board for board in boards])
     flanges = poses.transforms(pose_format)[list(chosen)]
     _check_motion(B, "board, seen by the camera,", poses.source)

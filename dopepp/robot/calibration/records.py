@@ -9,7 +9,6 @@ numbers, row by row, may replace position and rotation.
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,13 +140,13 @@ def read_points(path: Path, unit: str) -> Float[np.ndarray, "points 3"]:
 def _read_csv(path: Path) -> list[Record]:
     """Read the rows of a CSV file as mappings from lower-case column names to texts."""
     try:
-        text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
-    except (OSError, ValueError) as error:
+        lines = read_limited(path, MAX_BYTES).decode("utf-8-sig").splitlines()
+        separator = ";" if lines and ";" in lines[0] else ","
+        rows = list(csv.DictReader(lines, delimiter=separator))
+    except (OSError, ValueError, csv.Error) as error:
         allowed = f"a readable CSV file of at most {MAX_BYTES / 1e6:g} MB"
         fix = "pass the path of a CSV file in UTF-8"
         raise UserError(f"{path}: {error!s:.200}", allowed, fix) from error
-    separator = ";" if ";" in text.partition("\n")[0] else ","
-    rows = csv.DictReader(io.StringIO(text), delimiter=separator)
     return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
 
 

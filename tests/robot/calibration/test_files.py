@@ -55,6 +55,7 @@ def test_a_matrix_replaces_position_and_rotation(tmp_path):
         ("p.txt", "", "a .csv, .json or .yaml file"),
         ("p.csv", "", "without a pose"),
         ("p.csv", "x,y,z\n1,2,3\n", "qw, qx, qy, qz or"),
+        ("p.csv", "x,y,z\n" + 200_000 * "1", "field larger than field limit"),
         ("p.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0,nan\n", "pose 1: rz='nan'"),
         ("p.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0\n", "pose 1: rz=None"),
         ("p.csv", "x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", "unit quaternions"),
@@ -95,3 +96,9 @@ def test_touched_points_need_named_columns_of_any_separator(tmp_path):
     path.write_text("1,2,3\n4,5,6\n")
     with pytest.raises(UserError, match="the columns 1, 2, 3; allowed: columns x, y and z"):
         read_points(path, "mm")
+
+
+def test_lines_may_end_with_a_carriage_return(tmp_path):
+    (tmp_path / "points.csv").write_bytes(b"x;y;z\r1;2;3\r4;5;6\r")
+    points = read_points(tmp_path / "points.csv", "m")
+    assert points.tolist() == [[1, 2, 3], [4, 5, 6]]

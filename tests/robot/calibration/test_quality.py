@@ -154,3 +154,10 @@ def test_the_expected_error_agrees_with_drawn_calibrations():
     shift, rotation = expected_error(root @ root.T, 0.5)
     assert shift == pytest.approx(np.sqrt((moved**2).sum(axis=1).mean()), rel=0.03)
     assert rotation == pytest.approx(np.sqrt((steps[:, :3] ** 2).sum(axis=1).mean()), rel=0.03)
+
+
+def test_poses_without_an_image_of_the_board_are_rejected(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text("name,x,y,z,rx,ry,rz\na.png,0,0,0,0,0,0\n")
+    with pytest.raises(UserError, match="no pose has an image that shows the board"):
+        check_poses(read_robot_poses(path), [], PoseFormat(), [], "hand")
