@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import RunError, UserError, system_failure
 
 if TYPE_CHECKING:
     from dopepp.drawing.pictures import RGBImage
@@ -42,6 +42,7 @@ def predict_scene(
     Raises:
         UserError: There are fewer than two images, a source is not a still image, or an image
             has no pose or no camera.
+        RunError: A file cannot be written.
     """
     from dopepp.core.files import write_file
     from dopepp.inference.several_views.view_files import read_camera_poses
@@ -58,10 +59,13 @@ def predict_scene(
         *given[:3], distances=distances, camera_error=poses.error, names=given.names
     )
     _show(result)
-    if save is not None:
-        result.save(save)
-    if json_file is not None:
-        write_file(json_file, f"{result.to_json()}\n".encode())
+    content = f"{result.to_json()}\n".encode()
+    for path, write in (save, result.save), (json_file, lambda path: write_file(path, content)):
+        if path is not None:
+            try:
+                write(path)
+            except OSError as error:
+                raise RunError(system_failure(error, path)) from error
 
 
 def track_scene(

@@ -1,5 +1,6 @@
 """``dopepp predict`` with a released network and several cameras."""
 
+import errno
 import json
 import re
 import shutil
@@ -196,6 +197,17 @@ def test_several_views_of_a_scene(run, tmp_path):
     assert json.loads((tmp_path / "scene.json").read_text())["detections"] == [record]
     drawn = sorted(file.name for file in (tmp_path / "out").iterdir())
     assert drawn == ["0_a.png", "1_b.png"]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dopepp.core.files.Path.write_bytes", full)
+        for option, name in (("--save", "out"), ("--json", "scene.json")):
+            words = (*images, "--views", path, option, tmp_path / name)
+            done = run("predict", RELEASED, *words, code=1)
+            line = f"no space left for {tmp_path / name}: free some disk space"
+            assert done.stderr.splitlines()[-1] == line
     for name in views:  # a folder for each camera, as for a rig
         (tmp_path / name[0]).mkdir()
         shutil.copy(tmp_path / name, tmp_path / name[0] / "7.png")
