@@ -36,6 +36,8 @@ logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)
 
 import mujoco  # noqa: E402
 
+_log = logging.getLogger(__name__)
+
 Poses = Float[np.ndarray, "solids 4 4"]
 
 MAX_OVERLAP: Final = 0.008
@@ -102,7 +104,10 @@ def settle(
         poses = np.empty((0, 4, 4)) if settled is None else settled
         content = io.BytesIO()
         np.save(content, poses, allow_pickle=False)
-        write_file(path, content.getvalue())
+        try:
+            write_file(path, content.getvalue())
+        except OSError as error:
+            _log.warning("%s cannot be written, so the poses are not cached: %s", path, error)
     return poses if len(poses) == len(starts) else None
 
 

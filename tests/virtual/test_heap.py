@@ -198,3 +198,16 @@ def test_a_heap_refuses_visibility_options():
     for change in ({field: value} for field, value in changes.items()):
         with pytest.raises(UserError, match="physics decides what is visible"):
             preset_of("heap", change)
+
+
+def test_a_simulation_is_not_lost_if_its_cache_cannot_be_written(tmp_path, monkeypatch, caplog):
+    from dopepp.virtual.physics import settle  # needs the extra robot
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "dopepp").write_text("a file in place of the cache folder")
+    start = np.eye(4)[None]
+    start[0, 2, 3] = 0.05
+    corners = np.array(list(np.ndindex(2, 2, 2))) * 0.04 - 0.02
+    poses = settle([(corners,)], start, [], 0.07)
+    assert abs(poses[0, 2, 3] - 0.02) < 0.001
+    assert "cannot be written" in caplog.text
