@@ -1,5 +1,6 @@
 """The grasp commands: a few grasps, and wrong options."""
 
+import importlib.util
 import json
 
 import mujoco
@@ -117,6 +118,16 @@ def test_grasps_out_of_reach_are_an_error(run, tmp_path):
 def test_a_missing_extra_is_named(refused, tmp_path, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     assert "dopepp[robot]" in refused("grasp", "--out", tmp_path)
+
+
+def test_a_missing_viewer_is_an_error_before_the_first_grasp(refused, tmp_path, monkeypatch):
+    def find_spec(name):
+        return None if name == "rerun" else importlib.util.find_spec(name)
+
+    monkeypatch.setattr("dopepp.core.errors.find_spec", find_spec)
+    words = ("--poses", "exact", "-n", 2, "--workers", 1, "--rerun", tmp_path / "film.rrd")
+    assert "dopepp[rerun]" in refused("grasp", "--out", tmp_path / "out", *words)
+    assert not (tmp_path / "out" / "grasps.json").exists()
 
 
 @pytest.mark.parametrize("words", [["--video", "film.mp4"], ["--renderer", "mujoco"]])

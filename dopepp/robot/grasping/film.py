@@ -12,7 +12,6 @@ import cv2
 import mujoco
 import numpy as np
 
-from dopepp.core.errors import require
 from dopepp.core.files import draft, write_image
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import RGBImage, VideoFile
@@ -57,7 +56,7 @@ def show(
         write_image(folder / f"{failure.replace(' ', '_')}.jpg", strip(trials, attempt))
     if video is not None or rerun is not None:
         attempt = trials.attempt(trials.scene(0), first)
-        if video is not None and video.suffix == ".jpg":
+        if video is not None and video.suffix.lower() == ".jpg":
             write_image(video, strip(trials, attempt))
         elif video is not None:
             write_video(video, trials, attempt)
@@ -122,7 +121,6 @@ def write_video(path: Path, trials: Trials, attempt: Attempt) -> None:
 
 def write_rerun(path: Path, trials: Trials, attempt: Attempt) -> None:
     """Write a trial as a Rerun recording of the moving shapes of robot and solids."""
-    require("rerun", "--rerun", "rerun")
     import rerun as rr
 
     recording = rr.RecordingStream("dopepp grasp")

@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-from dopepp.core.errors import RunError, UserError, check_choice
+from dopepp.core.errors import RunError, UserError, check_choice, require
 from dopepp.core.files import check_target
 from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
 from dopepp.core.validation import Range, check
@@ -103,12 +103,15 @@ def make_experiment(
     films of the first trial, and ``report_progress`` a line of text after every 50 trials.
 
     Raises:
-        UserError: A file cannot be written, an image cannot be rendered, or no grasp is reachable.
+        UserError: A file cannot be written, the extra ``rerun`` is missing, an image cannot be
+            rendered, or no grasp is reachable.
     """
     targets = ((folder / "grasps.md", (".md",)), (video, (".mp4", ".jpg")), (rerun, (".rrd",)))
     for path, suffixes in targets:
         if path is not None:
             check_target(path, suffixes)
+    if rerun is not None:
+        require("rerun", "--rerun", "rerun")
     if video is not None or task.renderer == "mujoco":
         open_gl(Cell(shown="solids").model, SIZE).close()  # fail now, not after all trials
     start, records = time.monotonic(), list[Record]()
