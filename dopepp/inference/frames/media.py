@@ -16,7 +16,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -166,7 +165,7 @@ class Live(FrameSource):
     def __init__(self, address: int | str) -> None:
         self._address = address
         self.name = f"camera {address}" if isinstance(address, int) else _without_login(address)
-        self.stem = re.sub(r"[^\w.]+", "_", self.name.partition("?")[0]).strip("_")
+        self.stem = re.sub(r"[^\w.]+", "_", self.name).strip("_")
         self.rate = _plausible_rate(0.0)
 
     def frames(self, stride: int = 1) -> Iterator[CameraFrame]:
@@ -289,6 +288,5 @@ def _plausible_rate(rate: float) -> float:
 
 
 def _without_login(url: str) -> str:
-    """Return a URL without user name and password."""
-    host = urlsplit(url).netloc
-    return url.replace(host, host.rpartition("@")[2], 1) if host else url
+    """Return a URL without user name, password, query and fragment, which may hold a token."""
+    return re.split(r"[?#]", re.sub(r"//[^/]*@", "//", url))[0]

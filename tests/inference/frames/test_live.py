@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.inference.frames import media
+from dopepp.inference.frames import media, open_sources
 from dopepp.inference.frames.media import Live
 
 PERIOD = 1 / 30
@@ -126,3 +126,23 @@ def test_unopened_camera_is_reported_without_its_password(capfd):
         assert "secret" not in str(raised.value)
     assert Live("rtsp://me:secret@127.0.0.1:9/x").stem == "rtsp_127.0.0.1_9_x"
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("address", "name"),
+    [
+        ("rtsp://me:secret@camera/live?token=secret#secret", "rtsp://camera/live"),
+        ("http://camera/at@home?token=secret", "http://camera/at@home"),
+        ("http://[1", "http://[1"),
+    ],
+)
+def test_names_of_streams_have_no_secret(address, name):
+    (source,) = open_sources([address])
+    assert source.name == name
+    assert "secret" not in source.stem
+
+
+def test_an_invalid_address_is_reported():
+    (source,) = open_sources(["http://[1"])
+    with pytest.raises(UserError, match=r"http://\[1, which cannot be opened"):
+        next(source.frames())
