@@ -41,6 +41,7 @@ def benchmark(
     from dopepp.inference.network_estimator import NetworkEstimator
     from dopepp.parts.catalogue import with_meshes
 
+    options.check_region(refine)
     if (image is None) != (intrinsics is None):
         fix = "pass --image FILE --K FX FY CX CY, or leave out both"
         raise UserError("only one of --image and --K", "both or neither", fix)

@@ -45,7 +45,9 @@ def node(
         float | None,
         Option(help="With several topics: largest lag of a set's images, seconds (default: 1/60)."),
     ] = None,
-    name: Annotated[str, Option(help="Name of the node and prefix of its topics.")] = "dope",
+    name: Annotated[
+        str | None, Option(help="Name of the node and prefix of its topics (default: dope).")
+    ] = None,
     params: Annotated[Path | None, Option(help="With --ros2: YAML of parameters.")] = None,
     intrinsics: options.Intrinsics = None,
     camera: Annotated[Path | None, Option(help="Camera file, for camera_info.")] = None,
@@ -72,7 +74,12 @@ def node(
         transports = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
         chosen = [option for option, is_given in transports.items() if is_given]
         transport = _check_transport(chosen, words, out, params)
-        topics = topic or [TOPIC]
+        if transport in LINES:
+            for_ros = {"--frame": frame, "--overlay": overlay, "--name": name}
+            if given := ", ".join(option for option, value in for_ros.items() if value):
+                problem, allowed = f"{given} with {transport}", f"{given} with --ros2 or --bag"
+                raise UserError(problem, allowed, f"leave out {given}")
+        topics, name = topic or [TOPIC], name or "dope"
         for_several: dict[str, object] = {"--views": views, "--world": world, "--lag": lag}
         for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
         _check_topics(topics, transport, for_one if len(topics) > 1 else for_several)

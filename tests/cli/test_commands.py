@@ -43,6 +43,17 @@ def test_predict_verifies_and_refines(run, checkpoint, image_file, tmp_path):
             assert json.loads(line)["kept"]  # a pose on noise is reported
 
 
+def test_every_zeroth_frame_is_a_wrong_option(run, checkpoint, image_file):
+    done = run("predict", checkpoint, image_file, *K, "--stride", 0, code=2)
+    assert "--stride" in done.stderr
+
+
+def test_the_benchmark_refines_by_region_only(refused, checkpoint):
+    assert "--refine depth; allowed: region" in refused(
+        "benchmark", checkpoint, "--refine", "depth"
+    )
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -66,6 +66,9 @@ def test_each_datagram_holds_a_line(run, camera, intrinsics):
         (("{images}", "--json", "--camera", "none.yaml"), "none.yaml"),
         (("{images}", "--json", "--topic", "/a", "--topic", "/b"), "2 topics with --json"),
         (("{images}", "--json", "--views", "rig.yaml"), "--views with one topic"),
+        (("{images}", "--json", "--frame", "camera"), "--frame with --json"),
+        (("{images}", "--udp", "localhost:9", "--overlay"), "--overlay with --udp"),
+        (("{images}", "--json", "--name", "poses"), "--name with --json"),
     ],
 )
 def test_wrong_combinations_of_options_are_one_line(refused, camera, words, message):
