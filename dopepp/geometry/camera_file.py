@@ -52,12 +52,14 @@ class Camera:
         K: Camera matrix, pixels.
         distortion: Coefficients in OpenCV's order (k1, k2, p1, p2, k3, …), or ().
         source: Origin, for messages.
+        cropped: Whether the images are crops, with the principal point anywhere.
     """
 
     size: Size | None
     K: CameraMatrix
     distortion: tuple[float, ...]
     source: str
+    cropped: bool = False
 
     @property
     def coefficients(self) -> Float[np.ndarray, "coefficients"] | None:
@@ -96,14 +98,14 @@ class Camera:
                 allowed = f"the file's own size, {_size_text(self.size)}"
                 fix = f"leave out --K-size, or pass --K-size {self.size[0]} {self.size[1]}"
                 raise UserError(f"{stated} with {self.source}", allowed, fix)
-        calibrated = K_size or self.size
+        calibrated, off_centre = K_size or self.size, ANYWHERE if self.cropped else WHOLE
         if calibrated is not None:
-            check_camera(self.K, calibrated, self.source, WHOLE)
+            check_camera(self.K, calibrated, self.source, off_centre)
         if crop is not None:
             K = _check_and_crop(self.K, calibrated, size, crop)
             K = check_camera(K, size, self.source, ANYWHERE)
         elif calibrated is None or calibrated == size:
-            K = check_camera(self.K, size, self.source, WHOLE)
+            K = check_camera(self.K, size, self.source, off_centre)
         elif K_size is None or not _equal_aspect(size, calibrated):
             problem = f"{self.source}, whose K is for {_size_text(calibrated)}"
             problem += f", with an image of {_size_text(size)}"

@@ -183,8 +183,9 @@ def search_again(
 
     image, K, distances = result.image, result.K, options.get("distances")
     path, scale = options.get("depth"), options.get("depth_scale", 0.001)
-    depth = None if path is None else Lens(camera).read_depth(path, scale, K)
-    region = options.get("roi"), options.get("crop") is not None
+    lens = Lens(camera, crop=options.get("crop"))
+    depth = None if path is None else lens.read_depth(path, scale, K)
+    region = options.get("roi"), lens.is_cropped
     if distances is None:
         candidates = estimator.candidates(image, K, None, depth, "any", *region)
         detections, weaker = estimator.split(candidates)

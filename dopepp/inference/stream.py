@@ -88,7 +88,7 @@ def stream(
             raise UserError(problem, "one image", fix)
         read_depth = None if path is None else partial(lens.read_depth, path, scale)
         tracker = PoseTracker(estimator) if options.get("track") else None
-        given = estimator, shapes, lens.undistort, lens.crop is not None, tracker
+        given = estimator, shapes, lens.undistort, lens.is_cropped, tracker
         frame_estimator = FrameEstimator(*given, read_depth, distances, roi)
         frames = opened.frames(stride)
         if tracker is not None or opened.count == 1:

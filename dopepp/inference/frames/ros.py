@@ -122,7 +122,8 @@ def camera_of_info(info: Any, source: str, rectified: bool) -> Camera:
     x, y, width, height = region
     across, down = max(1, int(info.binning_x)), max(1, int(info.binning_y))
     K = resize_camera(crop_camera(sensor.K, x, y), 1 / across, 1 / down)
-    return Camera((width // across, height // down), K, sensor.distortion, source)
+    size = (width // across, height // down)
+    return Camera(size, K, sensor.distortion, source, is_cropped(info))
 
 
 class Bag(FrameSource):

@@ -54,6 +54,11 @@ class Lens:
     K_size: Size | None = None  # (width, height) that K belongs to, if images were resized
     crop: Crop | None = None  # region of the calibrated image, if images were cropped
 
+    @property
+    def is_cropped(self) -> bool:
+        """Whether the images may be crops; see :meth:`PoseEstimator.predict`."""
+        return self.crop is not None or self.camera.cropped
+
     def undistort(self, image: RGBImage) -> tuple[RGBImage, CameraMatrix]:
         """Return the image without lens distortion, and its K.
 

@@ -85,11 +85,11 @@ def joint_estimator(
     for number, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         if isinstance(camera, Camera):
             resized = camera.for_picture((image.shape[1], image.shape[0]))
-            K, distortion = resized.K, resized.coefficients
+            K, distortion, cropped = resized.K, resized.coefficients, resized.cropped
         else:
-            K, distortion = camera, None
+            K, distortion, cropped = camera, None, False
         depth = None if depths is None else depths[number]
-        image, K, depth = prepare_image(image, K, distortion, depth)
+        image, K, depth = prepare_image(image, K, distortion, depth, cropped)
         T = np.asarray(T_world_cam[number], np.float64)
         if not is_rigid(T):
             problem = f"T_world_cam of {names[number]}: {T.tolist()!s:.200}"

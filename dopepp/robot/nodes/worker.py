@@ -18,7 +18,7 @@ from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.frames import CameraFrame
-from dopepp.inference.frames.ros import camera_of_info, decode_image, is_cropped, is_rectified
+from dopepp.inference.frames.ros import camera_of_info, decode_image, is_rectified
 from dopepp.inference.frames.source import check_distortion
 from dopepp.inference.pose_result import PoseResult, make_shape
 from dopepp.inference.several_views.views_result import ViewsResult, WorldDetection
@@ -89,7 +89,6 @@ class Decoded:
 
     frame: CameraFrame
     camera: Camera
-    is_cropped: bool
     stamp: int
     frame_id: str  # name of the camera's optical frame
 
@@ -155,7 +154,7 @@ class Worker:
             return None
         self._check_time(decoded.stamp, shot.topic)
         try:
-            result = self.result(decoded.frame, decoded.camera, decoded.is_cropped)
+            result = self.result(decoded.frame, decoded.camera)
         except ValueError as error:
             self._reject("camera", str(error))
             return None
@@ -197,13 +196,10 @@ class Worker:
             self._reject(f"info {topic}", f"the camera_info of {topic}: {error!s:.300}")
             return None
         frame = CameraFrame(image, topic, self._number, stamp / 1e9)
-        return Decoded(frame, camera, given is None and is_cropped(info), stamp, frame_id)
+        return Decoded(frame, camera, stamp, frame_id)
 
-    def result(self, frame: CameraFrame, camera: Camera, cropped: bool = False) -> PoseResult:
+    def result(self, frame: CameraFrame, camera: Camera) -> PoseResult:
         """Estimate the poses in an image with the current settings, after undistorting it.
-
-        ``cropped`` states whether the image is a crop, with its principal point far from the
-        centre.
 
         Raises:
             UserError: The camera was calibrated for another image size.
@@ -214,7 +210,8 @@ class Worker:
         def undistort(image: RGBImage) -> tuple[RGBImage, CameraMatrix]:
             return camera.undistorted(image), camera.K
 
-        return FrameEstimator(estimator, self._shapes, undistort, cropped, self._tracker)(frame)
+        given = estimator, self._shapes, undistort, camera.cropped, self._tracker
+        return FrameEstimator(*given)(frame)
 
     def _checked_frame(self, frame_id: str, info: Any | None, topic: str) -> str:
         """Return the name of the poses' frame; warn if it does not contain "optical"."""

@@ -9,7 +9,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.frames import open_sources
-from dopepp.inference.frames.source import choose_camera
+from dopepp.inference.frames.source import Lens, choose_camera
 
 pytest.importorskip("rosbags")
 from functools import partial
@@ -60,10 +60,13 @@ class Recording:
             is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
         )  # fmt: skip
 
-    def camera(self, topic, **changes):
+    def region(self, *numbers):
+        return self._store.types["sensor_msgs/msg/RegionOfInterest"](*numbers, False)
+
+    def camera(self, topic, roi=None, **changes):
         large = {"k": K, "d": LENS, "p": P, "r": np.eye(3).ravel().tolist()}
         names = {name: name.upper() if self._is_ros1 else name for name in large}
-        roi = self._store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        roi = roi or self.region(0, 0, 0, 0)
         arrays = {names[first]: np.array(value, np.float64) for first, value in large.items()}
         fixed = {"height": 48, "width": 64, "distortion_model": "plumb_bob"}
         self.write(topic, "CameraInfo", 1, binning_x=0, binning_y=0, roi=roi,
@@ -141,6 +144,20 @@ def test_rectified_images_have_the_camera_of_p(tmp_path):
     assert choose_camera(None, straight, source) is straight
     with pytest.raises(UserError, match="coefficients for the rectified images"):
         choose_camera(None, replace(straight, distortion=(-0.1, 0.0, 0.0, 0.0)), source)
+
+
+def test_a_region_of_interest_is_a_crop(tmp_path):
+    with Recording("mcap", tmp_path) as bag:
+        roi = bag.region(4, 0, 48, 24)  # x, y, height, width
+        bag.camera("/cam/camera_info", roi=roi)
+        bag.image("/cam/image_raw", "rgb8", np.ascontiguousarray(IMAGE[:, 4:28]))
+    (source,) = open_sources([bag.path])
+    camera = choose_camera(None, None, source).for_picture((24, 48))
+    assert camera.K[0, 2] == 27.5  # outside the image
+    assert Lens(camera).is_cropped
+    whole = replace(source.camera, cropped=False)
+    with pytest.raises(UserError, match="principal point"):
+        whole.for_picture((24, 48))
 
 
 def test_choice_among_several_topics_is_required(tmp_path):

@@ -94,6 +94,22 @@ def test_poses_are_those_of_predict_views_in_the_world(
     assert not warnings
 
 
+def test_regions_of_interest_are_crops(estimator, stereo, shots, warnings):
+    worker = ViewsWorker(estimator, poses_of(stereo))
+    cut = []
+    for image, info, topic in shots():
+        pixels = np.frombuffer(image.data, np.uint8).reshape(480, 640, 3)[:, :400]
+        image = SimpleNamespace(**vars(image) | {"width": 400, "step": 1200})
+        image.data = pixels.tobytes()
+        info.roi.width, info.roi.height = 400, 480
+        cut.append(Shot(image, info, topic))
+    answer = worker.process(*cut)
+    assert not warnings
+    for view in answer.result.views:
+        assert view.image.shape == (480, 400, 3)
+        np.testing.assert_allclose(view.K, stereo.K)  # the region begins at pixel (0, 0)
+
+
 def test_missing_transforms_and_cameras_are_one_warning(estimator, stereo, shots, warnings):
     worker = ViewsWorker(estimator, None)
 
