@@ -8,12 +8,14 @@ folder. To add a format, see ``docs/how-to/adding-a-data-format.md``.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -35,6 +37,30 @@ ESTIMATED: Final = (
 )
 
 _ATTEMPTS: Final = 100
+
+
+@runtime_checkable
+class FileSource(Protocol):
+    """Source that lists its files, so that a cache on disk is not reused for changed files."""
+
+    def files(self) -> Iterable[Path]:
+        """Return the annotations, images and masks that determine the samples; some may lack."""
+
+
+def hash_files(paths: Iterable[Path], root: Path) -> str:
+    """Return the SHA-256 (hex) of the files' paths relative to ``root``, sizes and times.
+
+    The times are those of the last change. The code of this package, which reads the files, is
+    also hashed. Missing files are left out.
+    """
+    digest, package = hashlib.sha256(), Path(__file__).parent
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.read_bytes())
+    for path in paths:
+        with suppress(FileNotFoundError):
+            entry, name = path.stat(), os.path.relpath(path, root)
+            digest.update(f"{name} {entry.st_size} {entry.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
 
 
 class Writer(Protocol):

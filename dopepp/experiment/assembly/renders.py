@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import cache_folder
+from dopepp.data.formats import FileSource, hash_files
 from dopepp.data.rendered import MAX_LABELLED, CachedSource, RenderedSource, Split
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import Size
@@ -99,6 +100,8 @@ def with_cache(
     if isinstance(source, RenderedSource):
         identity += renderer_identity(source.factory.renderer)
         most = source.factory.preset.targets_per_image[1]
+    elif isinstance(source, FileSource) and folder is not None:
+        identity += hash_files(source.files(), data.root or Path())
     return CachedSource(source, input_size, folder, identity, max_instances=most)
 
 

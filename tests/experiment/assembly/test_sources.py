@@ -1,4 +1,6 @@
 import logging
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +10,7 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.data.rendered import RenderedSource
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.assembly.build_parts import PAPER_OBJECTS, build_parts
@@ -28,6 +31,7 @@ from dopepp.parts.catalogue import servoholder
 from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets import preset_of
 from dopepp.virtual.renderers import raster
+from tests.data.makers import LAYOUTS, write_set
 
 
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
@@ -81,6 +85,42 @@ def test_a_cache_on_disk_belongs_to_code_and_version_of_its_renderer(tiny, tmp_p
     monkeypatch.undo()
     code_hash.cache_clear()
     assert folder() == first
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_cache_on_disk_belongs_to_the_files_of_labelled_images(tiny, tmp_path, layout):
+    writer, reader = LAYOUTS[layout]
+    renders = RenderedSource(Factory([servoholder()], preset_of("quickstart"), 0), 5)
+
+    def cached(name, samples):
+        data = tiny(f"data.cache_dir={tmp_path}", f"data.root={tmp_path / name}").data
+        parts = [servoholder()]
+        root = write_set(writer, tmp_path / name / "set", parts, samples)
+        return with_cache(reader(root, parts), data, "disk", (64, 64))
+
+    samples = [renders.sample(number) for number in range(5)]
+    first, other = cached("a", samples[:2]), cached("b", samples[3:])
+    for cache, sample in ((first, samples[1]), (other, samples[4])):
+        (read,), (expected,) = cache.sample(1).instances, sample.instances
+        np.testing.assert_allclose(read.T_cam_obj, expected.T_cam_obj, atol=1e-6)
+    assert first.folder != other.folder
+
+
+@pytest.mark.parametrize("name", ["-color.png", "-label.png", "-meta.mat"])
+def test_a_cache_on_disk_is_not_reused_for_changed_files(tiny, ycb_root, tmp_path, name):
+    root = tmp_path / "ycb"
+    shutil.copytree(ycb_root, root)
+    data = tiny(f"data.cache_dir={tmp_path}", f"data.root={root}", "data.format=ycb_video").data
+
+    def folder():
+        source = YcbVideoReader(root, [part], ["0000/000001"])
+        return with_cache(source, data, "disk", (64, 64)).folder
+
+    part = replace(servoholder(), name=(root / "image_sets/classes.txt").read_text().split()[0])
+    first = folder()
+    assert folder() == first
+    os.utime(root / f"data/0000/000001{name}", (1, 1))
+    assert folder() != first
 
 
 def test_held_out_images_are_equal_for_all_seeds_and_differ_between_splits(tiny):

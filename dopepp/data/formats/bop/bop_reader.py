@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, floor
@@ -183,7 +183,7 @@ class BopReader:
         K = check_camera(item.K, (shape[1], shape[0]), where)
         instances = []
         for n, gt_id in enumerate(item.gt_ids.tolist()):
-            path = item.scene / "mask_visib" / f"{item.file.stem}_{gt_id:06d}.png"
+            path = _mask_path(item.scene, item.file, gt_id)
             mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
             part, T_cam_obj = self._parts[int(item.poses.obj_ids[n])], item.poses.T_cam_obj[n]
             fraction = float(item.poses.visible_fractions[n])
@@ -220,6 +220,16 @@ class BopReader:
         """Return whether the object is annotated on any selected image."""
         return bool(self._num_instances.get(label))
 
+    def files(self) -> Iterator[Path]:
+        """Yield the annotations of each scene, and the image and the masks of each item."""
+        for scene in dict.fromkeys(item.scene for item in self._items):
+            yield from sorted(scene.glob("*.json"))
+        for item in self._items:
+            assert item.file is not None
+            yield item.file
+            for gt_id in item.gt_ids.tolist():
+                yield _mask_path(item.scene, item.file, gt_id)
+
     def describe(self) -> list[SourceInfo]:
         """Return one entry: hashes of annotations and meshes, and the visible fractions' origin."""
         digest, is_stated = hashlib.sha256(), True
@@ -246,6 +256,10 @@ class BopReader:
 
 def _key(image: BopImage) -> tuple[int, int]:
     return int(image.scene.name), image.number
+
+
+def _mask_path(scene: Path, image: Path, gt_id: int) -> Path:
+    return scene / "mask_visib" / f"{image.stem}_{gt_id:06d}.png"
 
 
 def _scene_folders(root: Path, split: str) -> list[Path]:

@@ -175,6 +175,10 @@ class NddsReader:
             for _, _, name in ndds.objects_of(ndds.read_record(path) or {}, path)
         )
 
+    def files(self) -> list[Path]:
+        """Return all files of the folder."""
+        return sorted(path for path in self.folder.rglob("*") if path.is_file())
+
     def describe(self) -> list[SourceInfo]:
         """Return one entry: hashes, convention and, for up to 1,000 items, numbers of instances."""
         identity: dict[str, object] = {

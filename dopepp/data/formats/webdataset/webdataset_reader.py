@@ -118,6 +118,10 @@ class WebdatasetReader:
                 return True
         return False
 
+    def files(self) -> list[Path]:
+        """Return the shards."""
+        return [shard.path for shard in self._shards]
+
     def describe(self) -> list[SourceInfo]:
         """Return one entry: hashes of members and meshes, and the source of visible fractions."""
         digest, has_infos = hashlib.sha256(), True

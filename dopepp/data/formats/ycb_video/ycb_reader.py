@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -134,6 +134,12 @@ class YcbVideoReader:
         return bool(class_indices) and any(
             not class_indices.isdisjoint(self._meta(frame).poses) for frame in self.frames
         )
+
+    def files(self) -> Iterator[Path]:
+        """Yield the image, the labels and the poses of each frame."""
+        for frame in self.frames:
+            for name in ("color.png", "label.png", "meta.mat"):
+                yield Path(f"{self._start(frame)}-{name}")
 
     def describe(self) -> list[SourceInfo]:
         """Return one entry: hashes and, for at most 1,000 frames, the numbers of instances."""
