@@ -8,7 +8,6 @@ To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :d
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -18,7 +17,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import yaml
 
 from dopepp.core.errors import NO_SPACE, StoppedError, UserError, check_choice, system_failure
@@ -192,17 +190,11 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
 
 def _part_record(part: Part) -> dict[str, Any]:
     """Describe a part by its name, size and hashes of shape and appearance."""
-    mesh = part.mesh
-    appearance = hashlib.sha256()
-    arrays = () if mesh is None else (mesh.uv, mesh.texture, mesh.colours, mesh.normals)
-    for array in arrays:
-        if array is not None:
-            appearance.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
     return {
         "name": part.name,
         "diameter": float(part.diameter),
         "mesh_hash": part.mesh_hash,
-        "texture_hash": appearance.hexdigest(),
+        "texture_hash": part.appearance_hash(),
     }
 
 

@@ -6,6 +6,7 @@ A record holds a part as JSON values in a checkpoint. Checkpoints are not truste
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -125,6 +126,15 @@ class Part:
         pairs = ((self.mesh, other.points), (other.mesh, self.points))
         trees = ((SurfaceTree(mesh.vertices, mesh.faces), points) for mesh, points in pairs)
         return all(bool((tree.distances(points) <= most).all()) for tree, points in trees)
+
+    def appearance_hash(self) -> str:
+        """Return the SHA-256 (hex) of the mesh's texture, colours and normals."""
+        digest, mesh = hashlib.sha256(), self.mesh
+        arrays = () if mesh is None else (mesh.uv, mesh.texture, mesh.colours, mesh.normals)
+        for array in arrays:
+            if array is not None:
+                digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
     @cached_property
     def light_mesh(self) -> tuple[Mesh, float] | None:

@@ -16,6 +16,7 @@ from dopepp.experiment.config.data_config import Cache, DataConfig, evaluation_d
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import with_meshes
+from dopepp.parts.mesh import hash_triangles
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
@@ -98,8 +99,13 @@ def with_cache(
         folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
     identity, most = code_hash(), MAX_LABELLED
     if isinstance(source, RenderedSource):
-        identity += renderer_identity(source.factory.renderer)
-        most = source.factory.preset.targets_per_image[1]
+        factory = source.factory
+        identity += renderer_identity(factory.renderer)
+        for part in (*factory.parts, *factory.negatives):
+            identity += part.appearance_hash()
+            if part.mesh is not None:  # may be decimated, unlike the mesh of ``mesh_hash``
+                identity += hash_triangles(part.mesh.vertices, part.mesh.faces)
+        most = factory.preset.targets_per_image[1]
     elif isinstance(source, FileSource) and folder is not None:
         identity += hash_files(source.files(), data.root or Path())
     return CachedSource(source, input_size, folder, identity, max_instances=most)

@@ -27,7 +27,7 @@ from dopepp.experiment.results.recording import measure_and_record
 from dopepp.experiment.run.evaluate import parts_of
 from dopepp.inference.network_estimator import NetworkEstimator
 from dopepp.metrics.row import shown_columns
-from dopepp.parts.catalogue import servoholder
+from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets import preset_of
 from dopepp.virtual.renderers import raster
@@ -121,6 +121,25 @@ def test_a_cache_on_disk_is_not_reused_for_changed_files(tiny, ycb_root, tmp_pat
     assert folder() == first
     os.utime(root / f"data/0000/000001{name}", (1, 1))
     assert folder() != first
+
+
+@pytest.mark.parametrize("role", ["parts", "negatives"])
+def test_a_cache_on_disk_belongs_to_the_appearance_of_all_parts(tiny, tmp_path, role):
+    data = tiny(f"data.cache_dir={tmp_path}").data
+    plain = replace(servoholder(), name="coloured")
+
+    def folder(part):
+        parts = {"parts": [pivconnector()], role: [part]}
+        factory = Factory(preset=preset_of("quickstart"), seed=0, **parts)
+        return with_cache(RenderedSource(factory, 2), data, "disk", (64, 64)).folder
+
+    def coloured(grey):
+        colours = np.full((len(plain.mesh.vertices), 3), grey, np.uint8)
+        return replace(plain, mesh=replace(plain.mesh, colours=colours))
+
+    assert coloured(10).mesh_hash == coloured(200).mesh_hash
+    assert len({folder(part) for part in (plain, coloured(10), coloured(200))}) == 3
+    assert folder(coloured(10)) == folder(coloured(10))
 
 
 def test_held_out_images_are_equal_for_all_seeds_and_differ_between_splits(tiny):
