@@ -271,10 +271,9 @@ def _fetch_shard(url: str, scheme: str, folder: Path | None) -> Path:
         problem = f"shards {url!r:.100}, which are not on this machine"
         allowed = "local shards, or a folder to download them into"
         raise UserError(problem, allowed, "set data.download_dir=FOLDER")
-    name = PurePosixPath(urlsplit(url).path).name
-    if not name.endswith(".tar"):
-        name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"
-    path = folder / name
+    # Shards of different data sets often have one name, e.g. shard-000000.tar.
+    stem = PurePosixPath(urlsplit(url).path).name.removesuffix(".tar")
+    path = folder / f"{stem}-{hashlib.sha256(url.encode()).hexdigest()[:12]}.tar"
     if path.exists():
         return path
     from webdataset.gopen import gopen, gopen_schemes  # imports torch where it is installed

@@ -244,7 +244,8 @@ def test_shards_are_downloaded_once_within_bounds(address, tmp_path, monkeypatch
         write_tar(tmp_path / "served" / f"shard-{n:06d}.tar", image_files(f"00000{n}_000000"))
     source = download()
     assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
-    assert contents(tmp_path / "downloads") == contents(tmp_path / "served")
+    served = contents(tmp_path / "served")
+    assert sorted(contents(tmp_path / "downloads").values()) == sorted(served.values())
     monkeypatch.setattr("dopepp.data.formats.webdataset.webdataset_reader.MAX_SHARD_BYTES", 1000)
     assert download().describe() == [source.describe()[0]]
     for arguments, message in (
@@ -255,3 +256,14 @@ def test_shards_are_downloaded_once_within_bounds(address, tmp_path, monkeypatch
         with pytest.raises(UserError, match=message):
             download(**arguments)
     assert list((tmp_path / "small").iterdir()) == []
+
+
+def test_shards_of_one_name_from_two_addresses_are_two_files(address, tmp_path):
+    keys = []
+    for number, folder in enumerate(("first", "second")):
+        path = tmp_path / "served" / folder / "shard-000000.tar"
+        write_tar(path, image_files(f"00000{number}_000000"))
+        url = f"{address}/{folder}/shard-000000.tar"
+        source = WebdatasetReader(tmp_path, [block(2)], url, download_dir=tmp_path / "downloads")
+        keys.append(source.sample(0).key)
+    assert keys == ["000000_000000", "000001_000000"]
