@@ -77,6 +77,7 @@ def test_entries_by_name_apply_to_the_named_parts(block):
     ({"block": [HALF_TURN]},
      r"data.symmetries.block: .*symmetries_discrete and symmetries_continuous"),
     ({"block": {"half_turns": 1}}, r"data.symmetries.block: .*symmetries_discrete and"),
+    ({"blok": {}}, r"data.symmetries of blok; allowed: block"),
     ({"block": {"symmetries_discrete": [[1] * 16]}},
      r"block: symmetries_discrete\[0\]: not a rotation"),
 ], ids=str)  # fmt: skip
