@@ -39,7 +39,8 @@ Order = Int[np.ndarray, " items"]
 class HybridSource:
     """Mix of real, virtual and synthetic frames with exact shares.
 
-    An epoch holds round(share × samples_per_epoch) items of each source in a random order. Each
+    An epoch holds round(share × samples_per_epoch) real items, the same share of synthetic items
+    among the remaining ones, and virtual items, in a random order. Each
     source is traversed in its own shuffled order across epochs, so that its items are used equally
     often; the number of the traversal is the epoch of the source. A missing source gives its share
     to the other sources, of which there must be one.
@@ -67,7 +68,7 @@ class HybridSource:
             _log.warning("there are no virtual images: the real share is 1, not %g", real_fraction)
             real_fraction = 1.0
         num_real = round(real_fraction * samples_per_epoch)
-        num_synthetic = round((1 - real_fraction) * synthetic_fraction * samples_per_epoch)
+        num_synthetic = round(synthetic_fraction * (samples_per_epoch - num_real))
         if synthetic is None or virtual is None:
             num_synthetic = 0 if synthetic is None else samples_per_epoch - num_real
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)

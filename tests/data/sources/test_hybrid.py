@@ -47,7 +47,7 @@ def test_shares_are_exact_and_items_used_equally(real, virtual, synthetic, fract
         epoch_items = items(mix, epoch)
         counts = Counter(name for name, _ in epoch_items)
         assert counts["real"] == round(fraction * length)
-        expected = 0 if synthetic is None else (1 - fraction) * synthetic_fraction * length
+        expected = 0 if synthetic is None else synthetic_fraction * (length - counts["real"])
         assert abs(counts["synthetic"] - expected) <= 0.5
         assert (counts["real"], counts["virtual"], counts["synthetic"]) == mix.counts
         used.update((name, key.partition("/")[2]) for name, key in epoch_items)
@@ -180,3 +180,9 @@ def test_pixels_outside_the_window_are_not_visible(has_mask, frames):
     assert sum(fractions) == pytest.approx(instance.visible_fraction, abs=1e-3)
     assert min(fractions) > 0.1
     assert crop_sample(sample, 0, 0, (2, 2)).instances[0].visible_fraction == 0
+
+
+def test_no_count_is_negative():
+    sources = [named(name, 3) for name in ("real", "virtual", "synthetic")]
+    real, virtual, synthetic = sources
+    assert HybridSource(real, virtual, 0.5, 10003, 0, synthetic, 1.0).counts == (5002, 0, 5001)
