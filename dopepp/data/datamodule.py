@@ -112,7 +112,13 @@ class PoseDataModule(LightningDataModule):
 
     def train_dataloader(self) -> PoseLoader:
         """Return the loader of batches in random order; the last incomplete batch is dropped."""
-        return self._loader(self.train_item, self.train_source, shuffle=True)
+        loader = self._loader(self.train_item, self.train_source, shuffle=True)
+        if not len(loader):
+            problem = f"{len(self.train_source)} training images for processes with batches of "
+            fix = "lower data.batch_size or trainer.devices, or raise data.samples_per_epoch"
+            allowed = "at least one full batch per process and epoch"
+            raise UserError(f"{problem}{self.batch_size}", allowed, fix)
+        return loader
 
     def val_dataloader(self) -> PoseLoader:
         """Return the loader of batches in order; all ranks together yield each item once."""

@@ -154,6 +154,10 @@ def test_an_object_without_any_instance_fails_at_start(build):
 def test_wrong_options(build):
     with pytest.raises(UserError, match="12 training images for batches of 13"):
         build(batch_size=13)
+    divided = build(batch_size=8)
+    divided.trainer = SimpleNamespace(global_rank=0, world_size=2)
+    with pytest.raises(UserError, match="12 training images for processes with batches of 8"):
+        divided.train_dataloader()
     with pytest.raises(ValueError, match="masking requires backgrounds"):
         build(backgrounds=None)
     assert build(masking=None, augment=None, backgrounds=None).train_item(0, 0).size == (64, 64)
