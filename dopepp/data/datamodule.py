@@ -40,6 +40,7 @@ from dopepp.data.transforms.masking import RandomMask
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import Letterbox, focal_length, transform
 from dopepp.geometry.cuboid import CENTROID
+from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.parts.part import Part
 from dopepp.parts.size import LearnedRange, enclosing_range
 from dopepp.virtual.backgrounds import Backgrounds
@@ -150,6 +151,7 @@ class PoseDataModule(LightningDataModule):
         """Measure each part's range of size (pixels of the input) and depth (metres), by name.
 
         The first 200 validation images are measured, then training images for parts that they lack.
+        Instances that are less than 10 % visible are ignored.
         """
         views: dict[str, list[LearnedRange]] = {part.name: [] for part in parts}
         for source in (self.val_source, self.train_source):
@@ -158,10 +160,11 @@ class PoseDataModule(LightningDataModule):
                 sample = source.sample(index)
                 scale = Letterbox.fit(sample.size, self.input_size).scale_x
                 for part, instance in itertools.product(missing, sample.instances):
-                    if instance.label == part.name:
-                        depth = float(transform(instance.T_cam_obj, part.cuboid[CENTROID])[2])
+                    depth = float(transform(instance.T_cam_obj, part.cuboid[CENTROID])[2])
+                    is_seen = instance.visible_fraction >= MIN_VISIBLE_FRACTION and depth > 0
+                    if instance.label == part.name and is_seen:
                         pixels = scale * focal_length(sample.K) * part.diameter / depth
-                        views[part.name].append(LearnedRange(pixels, pixels, depth, depth))
+                        views[part.name].append(LearnedRange.of(pixels, depth))
         return {name: enclosing_range(sizes) for name, sizes in views.items() if sizes}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:

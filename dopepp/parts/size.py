@@ -13,6 +13,8 @@ from dopepp.parts.mesh.read import body_extents
 from dopepp.parts.part import Part
 
 _PLAUSIBLE: Final = (0.01, 2.0)  # Diameters of parts that a gripper can hold, metres
+_SIZES: Final = (0.1, 1e5)  # Limits of a learned size, pixels
+_DEPTHS: Final = (1e-4, 1e4)  # Limits of a learned distance, metres
 _LISTED: Final = 3  # Most bodies whose sizes the log lists
 
 
@@ -63,9 +65,15 @@ class LearnedRange(NamedTuple):
         """Convert a list of the four values in a checkpoint; raise a UserError for another one."""
         limits = "the learned range of sizes"
         four = check(limits, values, tuple[float, float, float, float], Range(1e-4, 1e5))
-        sizes = check("sizes of a part", four[:2], tuple[float, float], Span(0.1, 1e5, "pixels"))
-        depths = check("distances of a part", four[2:], tuple[float, float], Span(1e-4, 1e4, "m"))
+        sizes = check("sizes of a part", four[:2], tuple[float, float], Span(*_SIZES, "pixels"))
+        depths = check("distances of a part", four[2:], tuple[float, float], Span(*_DEPTHS, "m"))
         return cls(*sizes, *depths)
+
+    @classmethod
+    def of(cls, pixels: float, depth: float) -> LearnedRange:
+        """Return the range of a single view, within the limits of :meth:`parse`."""
+        size, distance = float(np.clip(pixels, *_SIZES)), float(np.clip(depth, *_DEPTHS))
+        return cls(size, size, distance, distance)
 
 
 def enclosing_range(ranges: Sequence[LearnedRange]) -> LearnedRange:

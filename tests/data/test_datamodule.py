@@ -13,6 +13,7 @@ from dopepp.data.rendered import CachedSource
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.parts.part import make_part
+from dopepp.parts.size import LearnedRange
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 
 
@@ -143,6 +144,28 @@ def test_size_ranges_are_measured_on_validation_images(build, fake_source):
     ranges = build().size_ranges([part, replace(part, name="can")])
     expected = (focal * part.diameter / far, focal * part.diameter / near, near, far)
     assert ranges == {"box": pytest.approx(expected)}
+
+
+def test_sizes_of_instances_that_no_image_shows_are_ignored(build, fake_source):
+    part = make_part("box", None, np.array([[0.0, 0, 0], [0.1, 0.1, 0.2]]))
+    source = fake_source(5)
+    visible = build(val=source).size_ranges([part])
+    make = source.sample
+
+    def with_hidden(index, epoch=0):
+        sample = make(index, epoch)
+        shown = sample.instances[0]
+        behind, far = shown.T_cam_obj.copy(), shown.T_cam_obj.copy()
+        behind[2, 3], far[2, 3] = -1.0, 1e3
+        hidden = [
+            replace(shown, T_cam_obj=behind),
+            replace(shown, T_cam_obj=far, visible_fraction=0.0),
+        ]
+        return replace(sample, instances=[shown, *hidden])
+
+    source.sample = with_hidden
+    assert build(val=source).size_ranges([part]) == visible
+    assert LearnedRange.parse([*LearnedRange.of(1e-3, 2e4)]) == (0.1, 0.1, 1e4, 1e4)
 
 
 def test_an_object_without_any_instance_fails_at_start(build):
