@@ -28,7 +28,7 @@ class Throughput(Callback):
     def __init__(self, cache: str = "none") -> None:
         self._is_cached = cache != "none"
         self._images, self._waited = 0, 0.0
-        self._started = self._step_ended = 0.0
+        self._started = self._step_ended = self._validation_started = 0.0
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Reset the number of images and the waiting time."""
@@ -47,6 +47,16 @@ class Throughput(Callback):
         """Count the images of all processes."""
         self._images += len(batch) * trainer.world_size
         self._step_ended = time.perf_counter()
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Store the time at which a validation starts."""
+        self._validation_started = time.perf_counter()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Exclude the validation, which may come within an epoch, from all times."""
+        validated = time.perf_counter() - self._validation_started
+        self._started += validated
+        self._step_ended += validated
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log images per second and the share of waiting over the epoch."""

@@ -175,3 +175,20 @@ def test_the_operators_of_a_training(make_system, make_noise, make_trainer, tmp_
     names = [path.name for path in (tmp_path / "profile").iterdir()]
     assert [name.endswith(".txt") for name in sorted(names, key=len)] == [True, False]
     assert any(name.endswith(".json") for name in names)
+
+
+def test_validation_within_an_epoch_is_not_waiting_for_the_loader(monkeypatch):
+    clock = iter([0.0, 1.0, 2.0, 2.0, 102.0, 103.0, 104.0])
+    monkeypatch.setattr(throughput.time, "perf_counter", lambda: next(clock))
+    trainer, logged = SimpleNamespace(world_size=1, is_global_zero=False), {}
+    module = SimpleNamespace(log=lambda name, value, **_: logged.update({name: value}))
+    callback = throughput.Throughput()
+    callback.on_train_epoch_start(trainer, module)
+    callback.on_train_batch_start(trainer, module)
+    callback.on_train_batch_end(trainer, module, None, [0] * 4)
+    callback.on_validation_start(trainer, module)
+    callback.on_validation_end(trainer, module)
+    callback.on_train_batch_start(trainer, module)
+    callback.on_train_batch_end(trainer, module, None, [0] * 4)
+    callback.on_train_epoch_end(trainer, module)
+    assert logged == {"throughput/images_per_s": 2.0, "throughput/loader_wait": 0.5}
