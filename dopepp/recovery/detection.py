@@ -113,6 +113,7 @@ class RecoveryOptions:
 
     Attributes:
         sigma: Standard deviation of a target's belief peak, cells.
+        field_radius: Radius of the disc around a corner that carries its vector, cells.
         peak_threshold: Belief below which a local maximum of a map does not count as a peak.
         centroid_threshold: Belief below which a centroid's peak is not an instance.
         max_angle_deg: Largest angle between the field's vector at a corner and the direction to the
@@ -138,6 +139,7 @@ class RecoveryOptions:
     __pydantic_config__ = STRICT
 
     sigma: Annotated[float, Range(0.1, 100.0, "cells")] = 1.0
+    field_radius: Annotated[float, Range(0.1, 1000.0, "cells")] = 2.0
     peak_threshold: _Belief = 0.02
     centroid_threshold: _Belief = 0.05
     max_angle_deg: Annotated[float, Range(1e-3, 180.0, "degrees")] = 45.0

@@ -98,7 +98,7 @@ def recover_batch(
         raise ValueError(f"{len(cuboids)} objects need as many names, got {labels}")
     if not labels:
         return [[] for _ in K]
-    geometry = MapGeometry(stride, chosen.sigma)
+    geometry = MapGeometry(stride, chosen.sigma, chosen.field_radius)
     peaks = find_peaks(belief, geometry, chosen.peak_threshold, chosen.max_peaks, field)
     cells = (belief.shape[-1], belief.shape[-2])
     max_angle = math.radians(chosen.max_angle_deg)

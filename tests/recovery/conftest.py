@@ -21,12 +21,12 @@ class Scene:
         self.poses.append(T_cam_obj)
         return self
 
-    def maps(self, sigma=1.0):
+    def maps(self, sigma=1.0, field_radius=2.0):
         placed = zip(self.objects, self.poses, strict=True)
         points = [project_keypoints(self.cuboids[index], T, self.K) for index, T in placed]
         belief, field = encode(
             torch.tensor(np.array(points))[None], torch.tensor(self.objects)[None],
-            len(self.cuboids), (52, 52), MapGeometry(8, sigma),
+            len(self.cuboids), (52, 52), MapGeometry(8, sigma, field_radius),
         )  # fmt: skip
         return belief[0], field[0]
 

@@ -37,6 +37,14 @@ def test_all_instances_are_recovered(name, count, box, plate, make_scene, pose):
         assert len({tuple(np.round(centre / 0.09).astype(int)) for centre in centres}) == count
 
 
+def test_vectors_count_in_the_disc_of_the_training(make_scene, box, pose):
+    scene = make_scene(box).place(0, pose(np.random.default_rng(1)))
+    belief, wide = scene.maps(field_radius=4.0)
+    _, narrow = scene.maps()
+    ring = torch.where(narrow == 0, wide, 0.0)
+    assert [len(scene.recover(belief, ring, field_radius=r)) for r in (2.0, 4.0)] == [0, 1]
+
+
 def test_two_objects_in_one_network(make_scene, box, plate, pose):
     rng = np.random.default_rng(1)
     for _ in range(8):

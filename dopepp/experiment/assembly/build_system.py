@@ -140,8 +140,8 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
         "num_objects": len(parts),
     }
     network = build_network(spec)
-    sigma = config.maps.sigma
-    recovery = vars(RecoveryOptions.of({"sigma": sigma, **config.recovery}))
+    sigma, maps = config.maps.sigma, vars(config.maps)
+    recovery = vars(RecoveryOptions.of({**maps, **config.recovery}))
     size = config.data.network_input
     return network, Checkpoint(spec, {}, parts, size, network.stride, sigma, recovery)
 

@@ -3,7 +3,9 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly import build_system as built
+from dopepp.experiment.assembly.build_parts import build_parts
 from dopepp.experiment.assembly.build_system import (
+    build_untrained,
     choose_precision,
 )
 from dopepp.experiment.config.run_config import TrainerConfig
@@ -65,3 +67,9 @@ def test_processes_of_torchrun_count(monkeypatch):
 def test_impossible_devices_are_rejected(devices):
     with pytest.raises(UserError, match=r"trainer\.devices="):
         _ = TrainerConfig(max_epochs=1, devices=devices).num_processes
+
+
+def test_a_checkpoint_has_the_geometry_of_the_maps(tiny):
+    config = tiny("maps.field_radius=3.5", "maps.sigma=1.5")
+    recovery = build_untrained(config, build_parts(config.data))[1].recovery
+    assert (recovery["sigma"], recovery["field_radius"]) == (1.5, 3.5)
