@@ -36,9 +36,9 @@ class RefinedProgress(Callback):
     share of instances whose pose has a score of at least ``MIN_SCORE`` and an ADD(-S) below a tenth
     of the diameter.
 
-    The training ends when ``val/refined`` reaches ``stop_at``, if confirmed on further images.
-    ``every_s`` is the shortest time between two measurements, which take at most a tenth of the
-    time.
+    The training ends when ``val/refined`` reaches ``stop_at``. If there are more than 40 images,
+    the next images, up to number 100, must confirm the share. ``every_s`` is the shortest time
+    between two measurements, which take at most a tenth of the time.
     """
 
     def __init__(
@@ -82,7 +82,8 @@ class RefinedProgress(Callback):
         # Only rank 0 measures, so metrics are not gathered across processes.
         metrics = PoseMetrics(system.parts, sync_on_compute=False)
         share, count, precision = self._measure(estimator, metrics, 0, NUM_IMAGES)
-        if self.stop_at is not None and share >= self.stop_at:
+        has_more = len(self.images) > NUM_IMAGES
+        if self.stop_at is not None and share >= self.stop_at and has_more:
             share, count, precision = self._measure(estimator, metrics, NUM_IMAGES, NUM_CONFIRMING)
         low, high = wilson_interval(round(share * count), count)
         minutes = self._minutes()
@@ -115,8 +116,12 @@ class RefinedProgress(Callback):
             sample = self.images.sample(index)
             poses = estimator.predict(sample.image, sample.K)
             metrics.update(poses, sample.instances, sample.K, sample.image.shape[1])
-        row = metrics.compute()[MEAN]
-        return row.add_or_s_01d or 0.0, row.num_instances, row.precision or 0.0
+        rows = metrics.compute()
+        mean = rows.pop(MEAN)
+        # The mean over objects would weigh an object with few instances like the others.
+        hits = sum((row.add_or_s_01d or 0.0) * row.num_instances for row in rows.values())
+        count = mean.num_instances
+        return hits / count if count else 0.0, count, mean.precision or 0.0
 
     def _minutes(self) -> float:
         """Return the minutes of training, including interrupted runs."""

@@ -1,5 +1,8 @@
 """The measurement of refined poses during a training, with an estimator of true poses."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +12,7 @@ from dopepp.data.rendered import RenderedSource
 from dopepp.drawing.pictures import read_rgb
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import wilson_interval
+from dopepp.metrics.pose import PoseMetrics
 from dopepp.recovery.detection import Detection
 from dopepp.training import refined_progress
 from dopepp.training.refined_progress import NUM_CONFIRMING, NUM_IMAGES, RefinedProgress
@@ -127,6 +131,21 @@ def test_the_estimator_has_the_networks_present_weights(make_system, images):
     with torch.no_grad():
         expected = [maps[0] for maps in system.network.eval().maps(pixels[None])]
     torch.testing.assert_close(list(estimator.maps(image)), expected, atol=1e-4, rtol=1e-7)
+
+
+def test_all_instances_have_equal_weights(part, images):
+    other = replace(part, name="other")
+    (instance,) = images.sample(0).instances
+    both = [instance, replace(instance, label="other")]
+    samples = Repeated(
+        [replace(images.sample(0), instances=both if k == 0 else both[:1]) for k in range(10)]
+    )
+    estimator = SimpleNamespace(
+        predict=lambda image, K: TruePoses(images, lambda n: False).predict(image, K)
+    )
+    progress = RefinedProgress(samples, "region")
+    share, count, _ = progress._measure(estimator, PoseMetrics([part, other]), 0, 10)
+    assert (share, count) == (pytest.approx(10 / 11), 11)
 
 
 @pytest.mark.slow
