@@ -1,12 +1,14 @@
 """Convex pieces: the shape of a part for simulations of rigid bodies.
 
-The decomposition (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached under the
-hash of the mesh: for built-in parts in this package, for others in the user's cache.
+The decomposition (CoACD, Wei et al. 2022; extra ``robot``) takes a minute and is cached: for
+built-in parts in this package, for others in the user's cache, by triangles and settings.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import logging
 from pathlib import Path
 from typing import Any, Final
@@ -18,12 +20,20 @@ from scipy.spatial import ConvexHull
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import cache_folder, write_file
+from dopepp.parts.mesh import hash_triangles
 from dopepp.parts.part import Mesh, Part
 
 Piece = Float[np.ndarray, "vertices 3"]
 
 CONCAVITY: Final = 0.05  # CoACD's threshold: largest distance of a piece from its convex hull
 MAX_PIECES: Final = 64
+_SEARCH: Final = {
+    "resolution": 500,
+    "mcts_nodes": 10,
+    "mcts_iterations": 30,
+    "mcts_max_depth": 2,
+}
+_VERSION: Final = 1  # of the decomposition; a change makes all cached pieces anew
 _BUILT_IN: Final = Path(__file__).parent
 
 logger = logging.getLogger(__name__)
@@ -39,10 +49,13 @@ def convex_pieces(part: Part) -> tuple[Piece, ...]:
     if part.mesh is None:
         problem, allowed = f"part {part.name} without a mesh", "a built-in part or a mesh file"
         raise UserError(problem, allowed, "pass --part FILE")
-    name = f"{part.mesh_hash[:16]}.npz"
-    path = _BUILT_IN / name
+    path = _BUILT_IN / f"{part.mesh_hash[:16]}.npz"
     if not path.is_file():
-        path = cache_folder() / "solids" / name
+        # A part of a checkpoint has fewer triangles than the mesh of its hash.
+        triangles = hash_triangles(part.mesh.vertices, part.mesh.faces)
+        settings = json.dumps([_VERSION, triangles, CONCAVITY, MAX_PIECES, _SEARCH])
+        name = hashlib.sha256(settings.encode()).hexdigest()[:16]
+        path = cache_folder() / "solids" / f"{name}.npz"
     if not path.is_file():
         require("coacd", f"the decomposition of {part.name}", "robot")
         logger.info("%s: decomposing the mesh into convex pieces, once: a minute", part.name)
@@ -67,14 +80,13 @@ def _decompose(mesh: Mesh) -> tuple[Piece, ...]:
     import coacd
 
     coacd.set_log_level("error")
-    search = {"resolution": 500, "mcts_nodes": 10, "mcts_iterations": 30, "mcts_max_depth": 2}
     pieces: list[Any] = coacd.run_coacd(
         coacd.Mesh(mesh.vertices, mesh.faces),
         threshold=CONCAVITY,
         max_convex_hull=MAX_PIECES,
         preprocess_mode="auto",  # only for open meshes: it rounds edges
         seed=0,
-        **search,
+        **_SEARCH,
     )
     return tuple(np.asarray(vertices, np.float64) for vertices, _ in pieces)
 
