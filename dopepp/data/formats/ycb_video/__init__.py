@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -64,6 +65,9 @@ def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
 
 _HEADER_BYTES: Final = 128
 _MAX_META_BYTES: Final = 256_000_000
+_COMPRESSED: Final = 15  # type of an element (miCOMPRESSED)
+_MAX_NAME_BYTES: Final = 1024  # SciPy permits 32 dimensions before the name
+_MAX_FIELD_BYTES: Final = 1_000_000  # a pose takes 96 bytes
 _FIELDS: Final = ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth")
 _ALLOWED: Final = (
     "a complete MAT-5 file with cls_indexes (N), poses (3, 4, N) before the camera and factor_depth"
@@ -128,6 +132,9 @@ def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
     if not _is_complete(content):
         node.report(f"cut short after {len(content)} bytes", _ALLOWED)
     try:
+        if not all(map(_is_small, _elements(content))):
+            node.report(f"a field of over {_MAX_FIELD_BYTES / 1e6:.0f} MB", _ALLOWED)
+            return None
         # The other fields, e.g. vertmap, are large and not needed.
         return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
     except Exception as error:  # damage makes SciPy raise any type
@@ -138,11 +145,34 @@ def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
 def _is_complete(content: bytes) -> bool:
     """Return whether the last MAT-5 element (type, length, data) ends where the file ends."""
     # SciPy accepts a file that is truncated between or inside other variables.
-    start = _HEADER_BYTES
-    order = "<" if content[126:128] == b"IM" else ">"
+    return (
+        _HEADER_BYTES + sum(8 + size for _, _, size in _elements(content))
+        == len(content)
+        > _HEADER_BYTES
+    )
+
+
+def _elements(content: bytes) -> Iterator[tuple[int, memoryview, int]]:
+    """Yield the type, the data and the stated number of bytes of each MAT-5 element."""
+    start, order = _HEADER_BYTES, "<" if content[126:128] == b"IM" else ">"
     while start + 8 <= len(content):
-        start += 8 + int(np.frombuffer(content, f"{order}u4", 1, start + 4)[0])
-    return start == len(content) > _HEADER_BYTES
+        kind, size = map(int, np.frombuffer(content, f"{order}u4", 2, start))
+        start += 8
+        yield kind, memoryview(content)[start : start + size], size
+        start += size
+
+
+def _is_small(element: tuple[int, memoryview, int]) -> bool:
+    """Return whether SciPy can unpack an element with one of ``_FIELDS`` in little memory."""
+    kind, data, _ = element
+    if kind != _COMPRESSED:
+        return True
+    unpacker = zlib.decompressobj()
+    start = unpacker.decompress(data, _MAX_NAME_BYTES)
+    if any(name.encode() in start for name in _FIELDS):
+        unpacker.decompress(unpacker.unconsumed_tail, _MAX_FIELD_BYTES)
+        return not unpacker.unconsumed_tail
+    return True
 
 
 def _columns(node: Node, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:

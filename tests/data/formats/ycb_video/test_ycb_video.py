@@ -7,9 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import scipy.io
 import trimesh
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats.ycb_video import read_meta
 from dopepp.data.formats.ycb_video.ycb_reader import YcbVideoReader
 from dopepp.data.sample import hull_areas
 from dopepp.geometry.cuboid import cuboid_keypoints
@@ -183,3 +185,16 @@ def test_real_synthetic_frame_and_lists(ycb_root, caplog):
     sample = synthetic.sample(0)
     assert {instance.label for instance in sample.instances} <= set(names)
     assert sample.image.std() > 5
+
+
+def test_a_field_that_unpacks_to_much_memory_is_rejected(tmp_path):
+    path = tmp_path / "000001-meta.mat"
+    fields = {"poses": np.zeros((3, 4, 20_000)), "cls_indexes": [1.0], "factor_depth": 1e4}
+    scipy.io.savemat(path, {**fields, "vertmap": np.zeros((480, 640, 3))}, do_compression=True)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(UserError, match="a field of over 1 MB"):
+        read_meta(path)
+    fields["poses"] = np.eye(4)[:3, :, None]
+    fields["poses"][2, 3] = 1
+    scipy.io.savemat(path, {**fields, "vertmap": np.zeros((480, 640, 3))}, do_compression=True)
+    assert list(read_meta(path).poses) == [1]
