@@ -272,7 +272,7 @@ def _fetch_shard(url: str, scheme: str, folder: Path | None) -> Path:
         allowed = "local shards, or a folder to download them into"
         raise UserError(problem, allowed, "set data.download_dir=FOLDER")
     # Shards of different data sets often have one name, e.g. shard-000000.tar.
-    stem = PurePosixPath(urlsplit(url).path).name.removesuffix(".tar")
+    stem = PurePosixPath(urlsplit(url).path).name.removesuffix(".tar")[:100]
     path = folder / f"{stem}-{hashlib.sha256(url.encode()).hexdigest()[:12]}.tar"
     if path.exists():
         return path

@@ -132,14 +132,14 @@ def _load(path: Path, node: Node) -> dict[str, NDArray[Any]] | None:
     if not _is_complete(content):
         node.report(f"cut short after {len(content)} bytes", _ALLOWED)
     try:
-        if not all(map(_is_small, _elements(content))):
-            node.report(f"a field of over {_MAX_FIELD_BYTES / 1e6:.0f} MB", _ALLOWED)
-            return None
-        # The other fields, e.g. vertmap, are large and not needed.
-        return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
+        if all(map(_is_small, _elements(content))):
+            # The other fields, e.g. vertmap, are large and not needed.
+            return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
     except Exception as error:  # damage makes SciPy raise any type
         node.report(f"damaged ({error})", _ALLOWED)
         return None
+    node.report(f"a field of over {_MAX_FIELD_BYTES / 1e6:.0f} MB", _ALLOWED)
+    return None
 
 
 def _is_complete(content: bytes) -> bool:
