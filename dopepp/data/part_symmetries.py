@@ -50,10 +50,9 @@ def choose_symmetries(
             for part, tolerance in zip(parts, visible, strict=True)
         ]
     if isinstance(choice, Mapping):
-        names = [part.name for part in parts]
-        if unknown := sorted(set(choice) - set(names)):
-            fix = "name each entry like its part"
-            raise UserError(f"data.symmetries of {', '.join(unknown)}", ", ".join(names), fix)
+        # Not an error: data.objects may choose some objects of a data set.
+        if others := sorted(set(choice) - {part.name for part in parts}):
+            _log.warning("data.symmetries of %s: no part has this name", ", ".join(others))
         entries = {name: bop_models.parse_symmetries(name, entry) for name, entry in choice.items()}
     else:
         entries = _read_symmetries(choice)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, make_transform, project_keypoints, transform
+from dopepp.parts import convex
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.convex import convex_pieces
 from dopepp.robot.grasping.cell import TRAY, Cell
@@ -37,11 +38,13 @@ def test_a_part_without_a_mesh_has_no_pieces(part):
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"text"])
 def test_damaged_pieces_are_named(part, tmp_path, monkeypatch, content):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    path = tmp_path / "dopepp" / "solids" / f"{'0' * 16}.npz"
-    path.parent.mkdir(parents=True)
+    monkeypatch.setattr(convex, "_decompose", lambda mesh: (mesh.vertices,))
+    of_user = replace(part, mesh_hash="0" * 64)
+    convex_pieces(of_user)
+    (path,) = (tmp_path / "dopepp" / "solids").iterdir()
     path.write_bytes(content)
     with pytest.raises(UserError, match=rf"{path.name}: .* fix: delete this file"):
-        convex_pieces(replace(part, mesh_hash="0" * 64))
+        convex_pieces(of_user)
 
 
 def test_a_solid_has_the_pose_at_which_it_was_placed(part):
