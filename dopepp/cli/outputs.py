@@ -57,7 +57,7 @@ class Outputs:
     def _each(self, action: Callable[[Output], None]) -> None:
         with uninterrupted():
             for path, output in self._outputs:
-                with _disk_errors(path):
+                with disk_errors(path):
                     action(output)
 
     def __enter__(self) -> Outputs:
@@ -66,7 +66,7 @@ class Outputs:
     def __exit__(self, *_: object) -> None:
         with uninterrupted(), ExitStack() as stack:
             for path, output in self._outputs:
-                stack.enter_context(_disk_errors(path))
+                stack.enter_context(disk_errors(path))
                 stack.callback(output.close)
 
 
@@ -195,7 +195,7 @@ def _resolve_folder(path: Path) -> Path:
 
 
 @contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
+def disk_errors(path: Path) -> Iterator[None]:
     """Convert an ``OSError`` in a ``with`` block to a :class:`RunError` that names the path."""
     try:
         yield

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from dopepp.core.errors import RunError, UserError, system_failure
+from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
     from dopepp.drawing.pictures import RGBImage
@@ -44,6 +44,7 @@ def predict_scene(
             has no pose or no camera.
         RunError: A file cannot be written.
     """
+    from dopepp.cli.outputs import disk_errors
     from dopepp.core.files import write_file
     from dopepp.inference.several_views.view_files import read_camera_poses
 
@@ -62,10 +63,8 @@ def predict_scene(
     content = f"{result.to_json()}\n".encode()
     for path, write in (save, result.save), (json_file, lambda path: write_file(path, content)):
         if path is not None:
-            try:
+            with disk_errors(path):
                 write(path)
-            except OSError as error:
-                raise RunError(system_failure(error, path)) from error
 
 
 def track_scene(
