@@ -20,6 +20,7 @@ from jaxtyping import Shaped
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import draft, write_file
+from dopepp.core.pool import in_forked_process
 from dopepp.data.sample import (
     DescribedSource,
     Instance,
@@ -30,6 +31,7 @@ from dopepp.data.sample import (
 )
 from dopepp.drawing.pictures import Shape, Size
 from dopepp.virtual.factory import Factory
+from dopepp.virtual.renderers import survives_fork
 from dopepp.virtual.scene import Rendered
 
 Split = Literal["train", "val", "test"]
@@ -146,7 +148,11 @@ class CachedSource(WrappedSource):
     ) -> None:
         super().__init__(source, cached=True)  # all epochs are equal
         self._input_size, self._max_instances = input_size, max_instances
-        first = self._resized(0)
+        # The loader's workers fork this process.
+        is_forked = isinstance(source, RenderedSource) and not survives_fork(
+            source.factory.renderer
+        )
+        first = in_forked_process(self._resized, 0) if is_forked else self._resized(0)
         self._source_name = first.source
         self._shape, self._has_depth = first.image.shape[:2], first.depth is not None
         slot = _slot_layout(self._shape, self._has_depth, max_instances)

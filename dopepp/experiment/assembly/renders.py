@@ -97,7 +97,16 @@ def with_cache(
     folder = None
     if cache == "disk":
         folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
-    identity, most = code_hash(), MAX_LABELLED
+    most = MAX_LABELLED
+    if isinstance(source, RenderedSource):
+        most = source.factory.preset.targets_per_image[1]
+    identity = "" if folder is None else _identity(source, data.root or Path())
+    return CachedSource(source, input_size, folder, identity, max_instances=most)
+
+
+def _identity(source: DescribedSource, root: Path) -> str:
+    """Return what determines a source's samples, and its description does not contain."""
+    identity = code_hash()
     if isinstance(source, RenderedSource):
         factory = source.factory
         identity += renderer_identity(factory.renderer)
@@ -105,10 +114,9 @@ def with_cache(
             identity += part.appearance_hash()
             if part.mesh is not None:  # may be decimated, unlike the mesh of ``mesh_hash``
                 identity += hash_triangles(part.mesh.vertices, part.mesh.faces)
-        most = factory.preset.targets_per_image[1]
-    elif isinstance(source, FileSource) and folder is not None:
-        identity += hash_files(source.files(), data.root or Path())
-    return CachedSource(source, input_size, folder, identity, max_instances=most)
+    elif isinstance(source, FileSource):
+        identity += hash_files(source.files(), root)
+    return identity
 
 
 def training_preset(data: DataConfig) -> Preset:

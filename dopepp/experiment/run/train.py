@@ -64,6 +64,7 @@ from dopepp.training.run_checkpoints import FOLDER, check_free_space, newest_che
 from dopepp.training.system import PoseSystem
 from dopepp.training.throughput import FOLDER as PROFILE
 from dopepp.training.throughput import profile_rows
+from dopepp.virtual.renderers import survives_fork
 
 _log = logging.getLogger(__name__)
 
@@ -149,9 +150,9 @@ def _train(
         images = {split: describe_images(source) for split, source in sources.items()}
         return images, datamodule.size_ranges(parts)
 
-    # Mitsuba's threads in this process would not survive the fork of the loader's workers.
-    is_raster = config.data.virtual.renderer == "raster"
-    images, sizes = describe(parts) if is_raster else in_forked_process(describe, parts)
+    # The loader's workers fork this process.
+    may_render = survives_fork(config.data.virtual.renderer)
+    images, sizes = describe(parts) if may_render else in_forked_process(describe, parts)
     newest = _newest_checkpoint(config)
     # The file with the initial weights of a resumed run may no longer exist.
     initial = config if newest is None else replace(config, init_from=None)

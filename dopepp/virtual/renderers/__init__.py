@@ -49,6 +49,14 @@ def renderer_identity(name: str) -> str:
     return identity()
 
 
+def survives_fork(name: str) -> bool:
+    """Return whether a process that has rendered may fork, and the fork render on.
+
+    Mitsuba's threads end with a fork, and other renderers are not known.
+    """
+    return name == "raster"
+
+
 def _module(name: str) -> ModuleType:
     modules = (
         RENDERERS if name in RENDERERS else {**extensions.components("renderers"), **RENDERERS}

@@ -100,10 +100,20 @@ def _start() -> int:
         else:
             os.environ[LIBRARY_SETTING] = str(library)
     module, drjit = import_module("mitsuba"), import_module("drjit")
-    module.set_variant("scalar_rgb" if library is None else "llvm_ad_rgb")
+    module.set_variant(_variant(library))
     drjit.set_thread_count(num_threads())
     _log.info("Mitsuba %s, %s, libLLVM %s", module.__version__, module.variant(), library)
     return os.getpid()
+
+
+def usable_variant() -> str:
+    """Return the variant that renders use, without starting Mitsuba."""
+    require("mitsuba", "renderer 'photoreal'", "photoreal")
+    return _variant(_chosen_library())
+
+
+def _variant(library: Path | None) -> str:
+    return "scalar_rgb" if library is None else "llvm_ad_rgb"
 
 
 def _chosen_library() -> Path | None:

@@ -29,7 +29,7 @@ from jaxtyping import Float, Float32
 from dopepp.core.errors import require
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.rotation import Vector
-from dopepp.virtual.renderers.photoreal import mitsuba, num_threads
+from dopepp.virtual.renderers.photoreal import mitsuba, num_threads, usable_variant
 from dopepp.virtual.renderers.photoreal.mitsuba_scene import (
     Film,
     bounding_sphere,
@@ -102,11 +102,12 @@ def render(scene: Scene) -> Rendered:
 def identity() -> str:
     """Return the versions of Mitsuba, with its variant, and of Open Image Denoise's package.
 
+    Mitsuba is not started, because its threads would not survive the fork of a loader's workers.
+
     Raises:
-        UserError: Mitsuba cannot run in this process (see the docstring of this package).
+        UserError: Mitsuba is not installed, or an environment variable is invalid.
     """
-    mi = mitsuba()
-    return f"mitsuba {mi.__version__} {mi.variant()} pyoidn {version('pyoidn')}"
+    return f"mitsuba {version('mitsuba')} {usable_variant()} pyoidn {version('pyoidn')}"
 
 
 def _objects_window(scene: Scene) -> Box | None:

@@ -2,6 +2,7 @@
 
 import importlib
 import pickle
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.virtual import PRESETS, Factory, make_surface, render
 from dopepp.virtual.renderers import find_renderer, renderer_identity
+from dopepp.virtual.renderers.photoreal import mitsuba
 from dopepp.virtual.scene import Grooves, Light, Material, Panel, Plane, SceneObject
 from tests.parts.makers import mesh_of
 from tests.virtual.conftest import even_light
@@ -31,10 +33,19 @@ def photoreal():
 
 
 def test_the_identity_names_the_library_and_its_variant(photoreal):
-    mitsuba = importlib.import_module("mitsuba")
+    module = mitsuba()
     words = renderer_identity("photoreal").split()
-    assert words[:3] == ["mitsuba", mitsuba.__version__, mitsuba.variant()]
+    assert words[:3] == ["mitsuba", module.__version__, module.variant()]
     assert renderer_identity("raster") == ""  # the hash of dopepp's code is enough
+
+
+def test_the_identity_does_not_start_mitsuba(photoreal):
+    """The threads of a started Mitsuba do not survive the fork of a data loader's workers."""
+    code = (
+        "import sys; from dopepp.virtual.renderers import renderer_identity; "
+        "renderer_identity('photoreal'); assert 'mitsuba' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def lying(part, height, **options):
