@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from typer import Argument, Option
@@ -12,6 +12,10 @@ from typer import Argument, Option
 from dopepp.cli import options
 from dopepp.core.errors import UserError, interruptible, require
 from dopepp.core.validation import Range, check
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
 LINES: Final = ("--json", "--udp")
 TOPIC: Final = "/camera/image_raw"
@@ -73,12 +77,8 @@ def node(
     with interruptible("the node has stopped"):
         transports = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
         chosen = [option for option, is_given in transports.items() if is_given]
-        transport = _check_transport(chosen, words, out, params)
-        if transport in LINES:
-            for_ros = {"--frame": frame, "--overlay": overlay, "--name": name}
-            if given := ", ".join(option for option, value in for_ros.items() if value):
-                problem, allowed = f"{given} with {transport}", f"{given} with --ros2 or --bag"
-                raise UserError(problem, allowed, f"leave out {given}")
+        for_ros = {"--frame": frame, "--overlay": overlay, "--name": name}
+        transport = _check_transport(chosen, words, out, params, for_ros)
         topics, name = topic or [TOPIC], name or "dope"
         for_several: dict[str, object] = {"--views": views, "--world": world, "--lag": lag}
         for_one: dict[str, object] = {"--camera": camera, "--K": intrinsics, "--frame": frame}
@@ -87,16 +87,12 @@ def node(
         options.check_region(refine)
 
         from dopepp.geometry.camera import camera_matrix
+        from dopepp.inference.frames import open_sources
         from dopepp.inference.frames.source import choose_camera, given_camera
+        from dopepp.robot.nodes.worker import Worker, WorkerSettings
 
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         fixed_camera = given_camera(K, camera)
-
-        from dopepp.inference.frames import open_sources
-        from dopepp.inference.several_views.view_files import read_camera_poses
-        from dopepp.robot.nodes.views_worker import WORLD, ViewsWorker
-        from dopepp.robot.nodes.worker import Worker, WorkerSettings
-
         sources = open_sources(words, topics[0] if topic else None) if transport in LINES else []
         cameras = [choose_camera(None, fixed_camera, opened) for opened in sources]
         estimator = options.load_estimator(
@@ -105,14 +101,8 @@ def node(
         if track or refine or len(topics) > 1:
             estimator = estimator.refining("region")
         settings = WorkerSettings(conf, estimator.refiner is not None, overlay)
-        worker: Worker
         if len(topics) > 1:
-            poses, error = None, None
-            if views is not None:
-                file = read_camera_poses(views)
-                error = file.error
-                poses = [file.of(Path(topic.removesuffix("/compressed"))) for topic in topics]
-            worker = ViewsWorker(estimator, poses, world or WORLD, error, settings, track)
+            worker = _views_worker(estimator, settings, topics, views, world, track)
         else:
             worker = Worker(estimator, settings, fixed_camera, frame, track)
         if transport == "--ros2":
@@ -120,24 +110,49 @@ def node(
             from dopepp.robot.nodes.ros2 import run
 
             run(worker, topics, name, params, MAX_LAG_S if lag is None else lag)
-            return
+        elif transport in LINES:
+            from dopepp.robot.nodes.standalone import send_lines
 
-        from dopepp.robot.nodes.standalone import process_bag, send_lines
-
-        if transport in LINES:
             send_lines(worker, zip(sources, cameras, strict=True), udp)
         elif bag is not None and out is not None:
-            found = weaker = processed = skipped = 0
-            for answer in process_bag(worker, bag, out, topics[0] if topic else None, name):
-                if answer is None:
-                    skipped += 1
-                    continue
-                processed += 1
-                found += len(answer.result.detections)
-                weaker += answer.result.num_weaker
-            note = f", {skipped} skipped" if skipped else ""
-            note += f"; {weaker} weaker candidates" if weaker else ""
-            typer.echo(f"{out}: {found} poses in {processed} images{note}")
+            _process_bag(worker, bag, out, topics[0] if topic else None, name)
+
+
+def _views_worker(
+    estimator: PoseEstimator,
+    settings: WorkerSettings,
+    topics: Sequence[str],
+    views: Path | None,
+    world: str | None,
+    track: bool,
+) -> Worker:
+    """Return the worker for several topics; the camera poses are those of ``views`` or of TF."""
+    from dopepp.inference.several_views.view_files import read_camera_poses
+    from dopepp.robot.nodes.views_worker import WORLD, ViewsWorker
+
+    poses, error = None, None
+    if views is not None:
+        file = read_camera_poses(views)
+        error = file.error
+        poses = [file.of(Path(topic.removesuffix("/compressed"))) for topic in topics]
+    return ViewsWorker(estimator, poses, world or WORLD, error, settings, track)
+
+
+def _process_bag(worker: Worker, bag: Path, out: Path, topic: str | None, name: str) -> None:
+    """Write the poses in a recording's images to ``out``, and print their number."""
+    from dopepp.robot.nodes.standalone import process_bag
+
+    found = weaker = processed = skipped = 0
+    for answer in process_bag(worker, bag, out, topic, name):
+        if answer is None:
+            skipped += 1
+            continue
+        processed += 1
+        found += len(answer.result.detections)
+        weaker += answer.result.num_weaker
+    note = f", {skipped} skipped" if skipped else ""
+    note += f"; {weaker} weaker candidates" if weaker else ""
+    typer.echo(f"{out}: {found} poses in {processed} images{note}")
 
 
 def _check_topics(topics: Sequence[str], transport: str, excluded: Mapping[str, object]) -> None:
@@ -154,9 +169,16 @@ def _check_topics(topics: Sequence[str], transport: str, excluded: Mapping[str, 
 
 
 def _check_transport(
-    chosen: Sequence[str], words: Sequence[str], out: Path | None, params: Path | None
+    chosen: Sequence[str],
+    words: Sequence[str],
+    out: Path | None,
+    params: Path | None,
+    for_ros: Mapping[str, object],
 ) -> str:
-    """Return the only entry of ``chosen``; reject other numbers, and options that do not suit."""
+    """Return the only entry of ``chosen``; reject other numbers, and options that do not suit.
+
+    ``for_ros`` are options (values by name) that only suit ROS messages.
+    """
     if len(chosen) != 1:
         problem = " and ".join(chosen) or "no input and output"
         allowed = "one of --ros2, --bag FILE --out FILE, --json, --udp HOST:PORT"
@@ -165,6 +187,9 @@ def _check_transport(
     if transport in LINES and not words:
         fix = "write the source after the network, e.g. 0 for the first camera"
         raise UserError(f"{transport} without a source", "a camera, a video, images, …", fix)
+    if transport in LINES and (given := ", ".join(name for name, it in for_ros.items() if it)):
+        problem, allowed = f"{given} with {transport}", f"{given} with --ros2 or --bag"
+        raise UserError(problem, allowed, f"leave out {given}")
     if transport not in LINES and words:
         allowed = "no source: the images come from --topic or from the recording"
         raise UserError(f"{transport} with the source {words[0]}", allowed, f"leave out {words[0]}")

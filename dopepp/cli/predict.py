@@ -87,7 +87,6 @@ def predict(
     """
     gc.disable()  # all imported objects stay alive; collecting them would slow down the start
     with interruptible("the written files are complete"):
-        from dopepp.cli.outputs import BopCsv, JsonLines, Outputs, OverlayFolder
         from dopepp.cli.predict_scene import predict_scene, track_scene
         from dopepp.drawing.pictures import photo_size
         from dopepp.geometry.camera import camera_matrix
@@ -98,13 +97,6 @@ def predict(
         if meshes := [word for word in source if Path(word).suffix.lower() in READERS]:
             fix = "run the command for each part, or train a network for all parts"
             raise UserError(f"the mesh {meshes[0]} as a source", "one mesh, as the model", fix)
-        terms = () if refine is None else tuple(refine.split(","))
-        if ("depth" in terms) != (depth is not None):
-            raise UserError(
-                "--depth without --refine depth" if depth else "--refine depth without --depth",
-                "both options or neither",
-                "add --refine depth" if depth else "add --depth FILE",
-            )
         excluded: dict[str, object] = {"--verify": verify, "--depth": depth, "--roi": roi}
         if track:
             _exclude("--track", {**excluded, "--distance": distance})
@@ -112,23 +104,12 @@ def predict(
             excluded |= {"--csv": csv, "--rerun": rerun, "--show": show}
             excluded |= {"--crop": crop, "--K-size": K_size, "--topic": topic}
             _exclude("--views", {**excluded, "--stride": stride != 1})
-        if track or views:
-            if terms not in ((), ("region",)):
-                option = "--track" if track else "--views"
-                allowed = f"{option} with --refine region, its default"
-                raise UserError(f"{option} with --refine {refine}", allowed, "leave out --refine")
-            terms = ("region",)
+        terms = _terms(refine, depth, "--track" if track else "--views" if views else None)
         words = [[word] for word in source] if track and views else [source]  # one for each camera
         sources = [
             opened for group in words for opened in open_sources(group, topic, csv is not None)
         ]
-        outputs: list[tuple[Path, Any]] = []
-        if save is not None:
-            outputs.append((save, OverlayFolder(save, sources, stride)))
-        if json_file is not None:
-            outputs.append((json_file, JsonLines(json_file)))
-        if csv is not None:
-            outputs.append((csv, BopCsv(csv)))
+        outputs = _files(sources, stride, save, json_file, csv)
         K = None if intrinsics is None else camera_matrix(*intrinsics)
         cameras = [] if views else [choose_camera(K, camera, opened) for opened in sources]
         for opened, its_camera in zip(sources, cameras, strict=False):
@@ -158,6 +139,8 @@ def predict(
 
             recordings = [rerun] * (rerun is not None) + [None] * show
             outputs += [(path or Path("viewer"), Viewer(estimator, path)) for path in recordings]
+        from dopepp.cli.outputs import Outputs
+
         verification = _verification(known_parts) if verify else None
         stream_options: StreamOptions = {
             "stride": stride,
@@ -175,6 +158,46 @@ def predict(
                 _predict_source(
                     estimator, opened, its_camera, stream_options, verification, written
                 )
+
+
+def _terms(refine: str | None, depth: Path | None, scene_option: str | None) -> tuple[str, ...]:
+    """Return the terms of ``--refine``; reject terms that the other options exclude.
+
+    ``scene_option`` is ``--track`` or ``--views`` if one of them is given: it needs ``region``.
+    """
+    terms = () if refine is None else tuple(refine.split(","))
+    if ("depth" in terms) != (depth is not None):
+        raise UserError(
+            "--depth without --refine depth" if depth else "--refine depth without --depth",
+            "both options or neither",
+            "add --refine depth" if depth else "add --depth FILE",
+        )
+    if scene_option is None:
+        return terms
+    if terms not in ((), ("region",)):
+        allowed = f"{scene_option} with --refine region, its default"
+        raise UserError(f"{scene_option} with --refine {refine}", allowed, "leave out --refine")
+    return ("region",)
+
+
+def _files(
+    sources: Sequence[FrameSource],
+    stride: int,
+    save: Path | None,
+    json_file: Path | None,
+    csv: Path | None,
+) -> list[tuple[Path, Any]]:
+    """Return the outputs to files that are asked for, with their paths."""
+    from dopepp.cli.outputs import BopCsv, JsonLines, OverlayFolder
+
+    outputs: list[tuple[Path, Any]] = []
+    if save is not None:
+        outputs.append((save, OverlayFolder(save, sources, stride)))
+    if json_file is not None:
+        outputs.append((json_file, JsonLines(json_file)))
+    if csv is not None:
+        outputs.append((csv, BopCsv(csv)))
+    return outputs
 
 
 def _exclude(option: str, others: dict[str, object]) -> None:
