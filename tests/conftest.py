@@ -245,6 +245,9 @@ def near_truth(monkeypatch):
         def half_turned(self, T):
             return []
 
+        def turned(self, T):
+            return []
+
         def start(self, T, score, K):
             points, peaks = project_keypoints(self.part.cuboid, T, K), np.full((9, 2), np.nan)
             covariance = np.diag([0.03**2] * 3 + [0.001**2] * 3)

@@ -15,17 +15,19 @@ from typing import Final, Literal
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter
 
 from dopepp.core.errors import UserError
 from dopepp.core.pool import map_in_threads
 from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import RGBImage
-from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera import CameraMatrix, step_between
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator, SeenMaps
 from dopepp.inference.input_image import METRES, Depth, Distances, Region, check_region
 from dopepp.inference.network_input import are_same, merge_scales
 from dopepp.inference.refinement.refiner import Refine, refine_terms
+from dopepp.inference.refinement.verification import MIN_DIFFERENCE, Verifier
 from dopepp.inference.templates import TemplateDetector, distinct_poses
 from dopepp.inference.templates.background_level import background_log_odds
 from dopepp.inference.templates.ranking import learned_ranking
@@ -45,6 +47,7 @@ NUM_REFINED: Final = 20  # number of start poses of each part that are refined
 NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable
 REPEATS: Final = 2  # number of further refinements
 MAX_DIFFERENCE: Final = 2.0  # difference of log odds below which look-alikes are compared
+NEIGHBOURS: Final = 7  # turns that a turn with a high response is compared with
 MIN_TURN: Final = math.radians(45.0)  # smallest rotation between the poses of look-alikes
 
 # Limits of the working distance, diameters. A nearer part surrounds the camera. A farther part is
@@ -169,8 +172,9 @@ class TemplateEstimator(PoseEstimator):
         Of each part's start poses, only those with the best scores and those whose outlines fit
         best after the coarse round are refined. Start poses are so inaccurate that a single
         refinement may stop too early. Half turns often have nearly the same outline, so the best
-        pose is also refined after half turns. Tracked poses are refined only once. Under a time
-        limit, all poses are refined once, until the time is spent.
+        pose is also refined after half turns. A nearly round part is turned about its axis. Tracked
+        poses are refined only once. Under a time limit, all poses are refined once, until the time
+        is spent.
         """
         if followed:
             return super().refined(detections, image, K, depth, followed)
@@ -192,7 +196,10 @@ class TemplateEstimator(PoseEstimator):
             turned = detector.half_turned(best.T_cam_obj)
             starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
             group += map(again, refine(starts))
-            ends += self._without_look_alikes(group, image, K)
+            turn = partial(self._in_best_turn, image=image, K=K, refine=refine)
+            least = self.levels.get(detector.part.name, 0.0)
+            for end in self._without_look_alikes(group, image, K):
+                ends.append(turn(end) if log_odds(_probability(end)) > least else end)
         return ends
 
     def _refined_once(
@@ -237,9 +244,8 @@ class TemplateEstimator(PoseEstimator):
         """Remove poses of the best pose's instance, except the one whose distinctive lines fit.
 
         Poses are compared if they belong to one instance, and have similar probabilities and very
-        different rotations, e.g. half turns. See :meth:`Verifier.prefers`.
+        different rotations, e.g. half turns. See :meth:`Verifier.margins`.
         """
-        assert self.refiner is not None  # templates are always refined
         ends = sorted(ends, key=_probability, reverse=True)
         best, least = ends[0], log_odds(_probability(ends[0])) - MAX_DIFFERENCE
         same = [end for end in ends if are_same(end, best)]
@@ -247,9 +253,46 @@ class TemplateEstimator(PoseEstimator):
         for end in same:
             turn = rotation_angle(end.T_cam_obj[:3, :3].T @ best.T_cam_obj[:3, :3])
             is_close = log_odds(_probability(end)) > least and turn > MIN_TURN
-            if is_close and self.refiner.prefers(end, best, image, K):
-                best = end
+            if is_close:
+                poses = [end.T_cam_obj, best.T_cam_obj]
+                margin = self._verifier(best).margins(image, K, poses)[0, 1]
+                best = end if margin > MIN_DIFFERENCE else best
         return [best, *others]
+
+    def _in_best_turn(
+        self, end: Detection, image: RGBImage, K: CameraMatrix, refine: RefineOnce
+    ) -> Detection:
+        """Turn a nearly round part about its axis so that its distinguishing lines fit.
+
+        Turns at which the lines fit as well enlarge the covariance. See
+        :func:`~dopepp.inference.templates.turns.nearly_round_turns`.
+        """
+        detector, verifier = self._detector_of[end.object], self._verifier(end)
+        poses = [end.T_cam_obj]
+        with self.timed("refine"):
+            turned = detector.turned(end.T_cam_obj)
+            responses = [verifier.responses(image, K, ring) for ring in turned]
+            for ring, values in zip(turned, responses, strict=True):
+                is_peak = values >= maximum_filter(values, NEIGHBOURS, mode="wrap")
+                is_peak &= values > max(map(np.max, responses)) - MIN_DIFFERENCE / 2
+                poses += [ring[index] for index in np.flatnonzero(is_peak)]
+            if len(poses) == 1:
+                return end
+            margins = verifier.margins(image, K, poses)
+        np.fill_diagonal(margins, math.inf)
+        chosen = int(margins.min(axis=1).argmax())
+        if chosen > 0:
+            start = detector.start(poses[chosen], end.score, K)
+            (new,) = refine([replace(start, covariance=end.covariance)])
+            end = replace(new, kept="")
+        rivals = [poses[index] for index in np.flatnonzero(margins[chosen] < MIN_DIFFERENCE)]
+        steps = np.array([step_between(end.T_cam_obj, rival) for rival in rivals]).reshape(-1, 6)
+        return replace(end, covariance=end.covariance + steps.T @ steps / (len(steps) + 1))
+
+    def _verifier(self, detection: Detection) -> Verifier:
+        """Return the verifier of a detection's part."""
+        assert self.refiner is not None  # templates are always refined
+        return self.refiner.verifier(detection.object)
 
     def _recalibrated(self, refined: Sequence[Detection], by_depth: bool) -> list[Detection]:
         """Return the best refined detection of each instance, best first."""

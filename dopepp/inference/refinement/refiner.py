@@ -165,13 +165,11 @@ class Refiner:
         assert region is not None  # the caller requires the term ``region``
         return region.coarse_fit(image, K, detection.T_cam_obj, detection.covariance)
 
-    def prefers(
-        self, first: Detection, second: Detection, image: RGBImage, K: CameraMatrix
-    ) -> bool:
-        """Compare two similar poses of a part; see :meth:`Verifier.prefers`."""
-        verifier = self._refiners[first.object].verifier
+    def verifier(self, name: str) -> Verifier:
+        """Return the verifier of a part; requires the term ``region``."""
+        verifier = self._refiners[name].verifier
         assert verifier is not None  # the caller requires the term ``region``
-        return verifier.prefers(image, K, first.T_cam_obj, second.T_cam_obj)
+        return verifier
 
     def refine_views(
         self,

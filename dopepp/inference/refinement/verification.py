@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
@@ -25,7 +27,7 @@ from jaxtyping import Bool, Float, Int, Int16, UInt8
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import RGBImage
 from dopepp.geometry.camera import CameraMatrix, Transform, resize_camera
-from dopepp.inference.refinement.colour import SMALLEST_PX, crop_around, log_odds
+from dopepp.inference.refinement.colour import SMALLEST_PX, Crop, crop_around, log_odds
 from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import (
     Contour,
@@ -135,49 +137,93 @@ class Verifier:
             return 0.0
         return float(1 / (1 + np.exp(-learned_model().log_odds(evidence))))
 
-    def prefers(
-        self, image: RGBImage, K: CameraMatrix, first: Transform, second: Transform
-    ) -> bool:
-        """Return whether the lines that distinguish two similar poses are those of the first.
-
-        The poses of look-alikes share most lines, so their probabilities are nearly equal. Only
-        lines that are apart from the lines of the other pose distinguish them, e.g. the edges of
-        a small hole. The mean response of the first pose's must exceed that of the second's. A pose
-        without such lines has half the mean response of the shared lines.
+    def responses(
+        self, image: RGBImage, K: CameraMatrix, poses: Sequence[Transform]
+    ) -> Float[np.ndarray, "poses"]:
+        """Return the mean response along the outline and the creases of a part at each pose.
 
         Args:
             image: RGB.
             K: Camera matrix, pixels.
-            first: Pose T_cam_obj, metres.
-            second: Pose T_cam_obj, metres.
+            poses: Poses T_cam_obj at the same place, metres.
         """
-        one, other = posed(self.mesh, first, K), posed(self.mesh, second, K)
-        if one is None or other is None:
-            return False
-        pixels = np.concatenate([one.pixels, other.pixels])
-        corners = np.array([pixels.min(axis=0), pixels.max(axis=0)])
-        try:
-            crop = crop_around(image, K, corners, COMPARED_PX)
-        except UndecidedError:
-            return False
+        crop = self._crop_of([poses[0]], image, K, LONGEST_PX)
+        if crop is None:
+            return np.zeros(len(poses))
+        gradients, spacing = _gradients(crop.colours), max(1.5, 3.0 * crop.extent / SPACING)
+        means = np.zeros(len(poses))
+        for number, pose in enumerate(poses):
+            at = posed(self.mesh, pose, crop.K)
+            if at is not None:
+                ids = self._edges.drawn(at, crop.size)
+                contour = find_contour(self.mesh, at, (ids >= 0).astype(np.uint8), spacing)
+                lines = np.concatenate([_lines(contour), self._edges.visible(at, ids, spacing)])
+                responses = np.zeros(len(lines))
+                _respond(*gradients, lines, np.zeros((1, 2)), responses)
+                means[number] = responses.sum() / max(len(lines), 1)
+        return means
+
+    def margins(
+        self, image: RGBImage, K: CameraMatrix, poses: Sequence[Transform]
+    ) -> Float[np.ndarray, "poses poses"]:
+        """Compare poses of look-alikes: by how much the lines of one fit better than of another.
+
+        The poses share most lines, so their probabilities are nearly equal. Only lines that are
+        apart from the lines of the other pose distinguish them, e.g. the edges of a small hole. A
+        pose without such lines has half the mean response of the shared lines.
+
+        Args:
+            image: RGB.
+            K: Camera matrix, pixels.
+            poses: Poses T_cam_obj, metres.
+
+        Returns:
+            Mean response of the distinguishing lines of the first pose (row) minus that of the
+            second (column). A pose should be preferred from :data:`MIN_DIFFERENCE` on. All entries
+            are 0 if the part is not on the image.
+        """
+        margins = np.zeros((len(poses), len(poses)))
+        crop = self._crop_of(poses, image, K, COMPARED_PX)
+        if crop is None:
+            return margins
         factor = max(1, round(COMPARED_PX / crop.extent))  # small holes need many pixels
         size = factor * crop.size[0], factor * crop.size[1]
         K = resize_camera(crop.K, factor, factor)
         enlarged = np.asarray(cv2.resize(crop.colours, size, interpolation=cv2.INTER_CUBIC))
         gx, gy = _gradients(enlarged)
         strengths = factor * SCHARR * np.hypot(gx, gy).max(axis=2)
-        responses = strengths / (strengths + NOISE)
-        drawn = [self._line_pixels(pose, K, size) for pose in (first, second)]
-        distinctive, shared = [], []
-        for lines, others in zip(drawn, drawn[::-1], strict=True):
-            distance = cv2.distanceTransform((~others).astype(np.uint8), cv2.DIST_L2, 3)
-            is_apart = distance > MIN_DISTANCE * factor * crop.extent
-            distinctive.append(responses[lines & is_apart])
-            shared.append(responses[lines & ~is_apart])
-        common = np.concatenate(shared)
-        level = common.mean() / 2 if len(common) else 0.0
-        means = [values.mean() if len(values) else level for values in distinctive]
-        return bool(means[0] > means[1] + MIN_DIFFERENCE)
+        responses = (strengths / (strengths + NOISE)).ravel()
+        lines, are_apart = [], []  # pixels on lines, and whether each pixel is apart from lines
+        for pose in poses:
+            drawn = self._line_pixels(pose, K, size)
+            distance = cv2.distanceTransform((~drawn).astype(np.uint8), cv2.DIST_L2, 3)
+            lines.append(np.flatnonzero(drawn))
+            are_apart.append((distance > MIN_DISTANCE * factor * crop.extent).ravel())
+        for i, j in combinations(range(len(poses)), 2):
+            distinctive, shared = [], []
+            for own, other in (i, j), (j, i):
+                is_apart = are_apart[other][lines[own]]
+                distinctive.append(responses[lines[own][is_apart]])
+                shared.append(responses[lines[own][~is_apart]])
+            common = np.concatenate(shared)
+            level = common.mean() / 2 if len(common) else 0.0
+            first, second = (values.mean() if len(values) else level for values in distinctive)
+            margins[i, j], margins[j, i] = first - second, second - first
+        return margins
+
+    def _crop_of(
+        self, poses: Sequence[Transform], image: RGBImage, K: CameraMatrix, longest_px: int
+    ) -> Crop | None:
+        """Cut out the part at several poses; None if it is too small or not on the image."""
+        drawn = [posed(self.mesh, pose, K) for pose in poses]
+        if any(at is None for at in drawn):
+            return None
+        pixels = np.concatenate([at.pixels for at in drawn if at is not None])
+        corners = np.array([pixels.min(axis=0), pixels.max(axis=0)])
+        try:
+            return crop_around(image, K, corners, longest_px)
+        except UndecidedError:
+            return None
 
     def _line_pixels(
         self, pose: Transform, K: CameraMatrix, size: tuple[int, int]

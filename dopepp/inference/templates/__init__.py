@@ -33,7 +33,7 @@ from dopepp.geometry.camera import (
     resize_camera,
 )
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.geometry.symmetry import symmetry_group
+from dopepp.geometry.symmetry import rotations_about, symmetry_group
 from dopepp.inference.input_image import Region
 from dopepp.inference.network_input import MAX_PIXELS
 from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
@@ -46,6 +46,7 @@ from dopepp.inference.templates.ranking import (
     move_nearby,
 )
 from dopepp.inference.templates.responses import edge_responses
+from dopepp.inference.templates.turns import nearly_round_turns
 from dopepp.inference.templates.views import (
     NEAREST,
     concatenate_templates,
@@ -107,6 +108,8 @@ class TemplateDetector:
         self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
         self._half_turns = _half_turns(self._centre, group)
+        round_turns = nearly_round_turns(part.mesh, self._centre, part.diameter, group[:, :3, :3])
+        self._round_turns = [rotations_about(self._centre, turns) for turns in round_turns]
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
         # Near the camera, the perspective of a part changes strongly with its distance.
         nearness = np.minimum(part.diameter / np.array(working_distance), 1 / NEAREST)
@@ -191,6 +194,17 @@ class TemplateDetector:
         """
         turned = [T_cam_obj @ turn for turn in self._half_turns]
         return [pose for pose in turned if self._tilt(pose) <= math.radians(self._tilt_deg)]
+
+    def turned(self, T_cam_obj: Transform) -> list[list[Transform]]:
+        """Return a pose after turns of a nearly round part, a list for each axis and side.
+
+        Poses beyond the largest tilt are omitted; other parts have no list.
+        """
+        largest = math.radians(self._tilt_deg)
+        turned = [list(T_cam_obj @ turns) for turns in self._round_turns]
+        return [
+            kept for poses in turned if (kept := [it for it in poses if self._tilt(it) <= largest])
+        ]
 
     def _tilt(self, T_cam_obj: Transform) -> float:
         """Return the angle between the part's z axis and the direction to the camera, radians."""

@@ -12,7 +12,12 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.refinement.refiner import Refiner
-from dopepp.inference.refinement.verification import EVIDENCE, Verifier, learned_model
+from dopepp.inference.refinement.verification import (
+    EVIDENCE,
+    MIN_DIFFERENCE,
+    Verifier,
+    learned_model,
+)
 from dopepp.parts.part import make_part
 from dopepp.recovery.detection import Detection
 from dopepp.virtual.factory import Factory
@@ -128,11 +133,16 @@ def test_the_lines_of_a_look_alike_are_not_preferred(rendered):
     verifier = Verifier(make_outline_mesh(PART.mesh.vertices, PART.mesh.faces), PART.diameter)
     half_turn = make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     look_alike, away = T @ half_turn, make_transform(T[:3, :3], np.array([5.0, 0.0, 0.3]))
-    assert verifier.prefers(image, K, T, look_alike)
-    assert not verifier.prefers(image, K, look_alike, T)
-    assert not verifier.prefers(image, K, T, T)  # no line distinguishes a pose from itself
-    assert not verifier.prefers(np.full_like(image, 90), K, T, look_alike)
-    assert not verifier.prefers(image, K, away, away)
+    margins = verifier.margins(image, K, [T, look_alike, T])
+    np.testing.assert_array_equal(margins, -margins.T)
+    assert margins[0, 1] > MIN_DIFFERENCE
+    assert margins[0, 2] == 0  # no line distinguishes a pose from itself
+    grey = np.full_like(image, 90)
+    np.testing.assert_array_equal(verifier.margins(grey, K, [T, look_alike]), np.zeros((2, 2)))
+    np.testing.assert_array_equal(verifier.margins(image, K, [away, away]), np.zeros((2, 2)))
+    responses = verifier.responses(image, K, [T, move_pose(T, np.array([0.2, 0, 0, 0, 0, 0]))])
+    assert responses[0] > responses[1] + 0.1
+    assert verifier.responses(image, K, [away]) == 0
 
 
 def test_a_refined_detection_has_its_probability(rendered):
