@@ -85,17 +85,18 @@ class Board:
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
     def detect(self, image: RGBImage, name: str) -> BoardDetection | None:
-        """Detect the board in an RGB image; return None if fewer than 8 points are found.
+        """Detect the board in an RGB image; return None for under 8 points, or points in a line.
 
         Raises:
             UserError: The image shows two ChArUco markers of the same number, i.e. two boards.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         indices, pixels = getattr(self, f"_detect_{self.kind}")(grey)
-        if len(indices) < MIN_POINTS:
+        points = self.points[indices]
+        # Points in a row or column determine no homography, and OpenCV would reject all views.
+        if len(points) < MIN_POINTS or not np.ptp(points[:, :2], axis=0).all():
             return None
-        pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
-        return BoardDetection(name, self.points[indices], pixels)
+        return BoardDetection(name, points, np.asarray(pixels, np.float64).reshape(-1, 2))
 
     @property
     def first_px(self) -> float:

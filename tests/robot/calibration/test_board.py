@@ -3,6 +3,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
@@ -37,6 +38,17 @@ def test_points_are_detected_where_the_camera_projects_them(spec, roll):
 def test_no_board_is_detected_in_an_empty_image():
     empty = np.full((240, 320, 3), 128, np.uint8)
     assert all(parse_board(spec).detect(empty, "empty") is None for spec in BOARDS)
+
+
+def test_points_in_a_line_are_no_detection():
+    """One view with such points would make OpenCV reject the views of a whole calibration."""
+    board, rng = parse_board("charuco:8x11:20:15"), np.random.default_rng(0)
+    camera = Camera((640, 480), camera_matrix(600, 600, 319.5, 239.5), (), "a camera")
+    R = Rotation.from_euler("xyz", [0.2, 0.1, 0.05]).as_matrix()
+    image = draw_view(board, make_transform(R, np.array([-0.08, -0.11, 0.3])), camera, rng)
+    for width, is_detected in ((640, True), (246, False)):  # at 246, a column of 10 points
+        image[:, width:] = 110
+        assert (board.detect(image, "image") is not None) == is_detected
 
 
 @pytest.mark.parametrize("spec", BOARDS)
