@@ -33,6 +33,9 @@ MIN_ROTATION: Final = np.radians(5.0)  # smallest valid maximum of the rotations
 # Largest median errors over pairs under the correct convention, radians and metres.
 MAX_ROTATION_ERROR, MAX_SHIFT_ERROR = np.radians(1.5), 0.01
 SCALE: Final = 1.03  # largest negligible factor between the robot's and the camera's lengths
+# Mean error of a fit with equal lengths, as a multiple of that with free lengths and in metres,
+# up to which both fits are equally good.
+SAME_FIT, SMALLEST_SHIFT = 1.2, 1e-4
 MIN_POSES: Final = 8
 MIN_DIVERSITY: Final = np.radians(15.0)  # RMS rotation over pairs about the second main axis
 MAX_ERROR: Final = 0.003  # largest standard deviation at the board's distance, metres
@@ -76,16 +79,27 @@ def compare_motions(T_base_flange: Transforms, B: Transforms, mount: Mount) -> M
         weights = _robust_weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
         R = nearest_rotation((weights[:, None] * alpha).T @ beta)
     rotation = float(np.median(np.linalg.norm(alpha - beta @ R.T, axis=1)))
-    system = np.concatenate([P[:, :3, :3] - np.eye(3), P[:, :3, 3:]], axis=2)
-    target = Q[:, :3, 3] @ R.T
-    weights = np.ones(len(P))
+    turns, shifts, target = P[:, :3, :3] - np.eye(3), P[:, :3, 3:], Q[:, :3, 3] @ R.T
+    _, unscaled = _fit_shift(turns, target - shifts[..., 0])
+    solution, scaled = _fit_shift(np.concatenate([turns, shifts], axis=2), target)
+    # A flange that only rotates about its origin does not determine the scale.
+    if unscaled.mean() < max(SAME_FIT * scaled.mean(), SMALLEST_SHIFT):
+        return MotionAgreement(rotation, float(np.median(unscaled)), 1.0)
+    return MotionAgreement(rotation, float(np.median(scaled)), float(solution[3]))
+
+
+def _fit_shift(
+    system: Float[np.ndarray, "pairs 3 unknowns"], target: Float[np.ndarray, "pairs 3"]
+) -> tuple[Float[np.ndarray, "unknowns"], Float[np.ndarray, "pairs"]]:
+    """Solve a linear system by robust least squares; return the solution and each pair's error."""
+    weights = np.ones(len(target))
     for _ in range(8):
         root = np.sqrt(weights)[:, None]
-        weighted = (system * root[..., None]).reshape(-1, 4)
+        weighted = (system * root[..., None]).reshape(target.size, -1)
         solution = np.linalg.lstsq(weighted, (target * root).ravel(), rcond=None)[0]
         errors = np.linalg.norm(system @ solution - target, axis=1)
         weights = _robust_weights(errors)
-    return MotionAgreement(rotation, float(np.median(errors)), float(solution[3]))
+    return solution, errors
 
 
 def _robust_weights(errors: Float[np.ndarray, "pairs"]) -> Float[np.ndarray, "pairs"]:
@@ -178,10 +192,8 @@ def _format_error(
     """Return the error that names the conventions under which robot poses fit the images."""
     changes = [advice] if advice else []
     if not same_mount:
-        changes.append(
-            "poses from base to flange (--direction base-to-flange), or the camera on the other "
-            "mount (--mount)"
-        )
+        direction = "flange-to-base" if pose_format.inverted else "base-to-flange"
+        changes.append(f"--direction {direction}, or the camera on the other mount (--mount)")
     unit = _unit_of(scale, pose_format.unit)
     if unit is None:
         changes.append(f"lengths of {scale:.4g} times the robot's")

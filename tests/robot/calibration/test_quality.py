@@ -8,9 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera import make_transform
+from dopepp.robot.calibration.board import parse_board
 from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
 from dopepp.robot.calibration.quality import assess, check_poses, expected_error
 from dopepp.robot.calibration.records import PoseFormat, read_robot_poses
+from tests.robot.calibration.conftest import take
 
 
 def write(path, T, kind="quaternion", unit=1.0, degrees=False, xyzw=False):
@@ -62,8 +65,8 @@ def test_poses_under_the_right_convention_pass(cell, tmp_path, mount, style, pos
     ({"kind": "euler", "degrees": True}, PoseFormat(), "hand", "--angles deg"),
     ({"xyzw": True, "unit": 1e-3}, PoseFormat(), "hand", "--quaternion xyzw, and --unit mm"),
     ({"kind": "euler", "degrees": True, "unit": 1e-3}, PoseFormat(), "bench", "--unit mm"),
-    ({}, PoseFormat(inverted=True), "hand", "--direction"),
-    ({}, PoseFormat(inverted=True), "bench", "--direction"),
+    ({}, PoseFormat(inverted=True), "hand", "--direction flange-to-base"),
+    ({}, PoseFormat(inverted=True), "bench", "--direction flange-to-base"),
 ])  # fmt: skip
 def test_a_wrong_convention_is_recognised(cell, tmp_path, style, pose_format, mount, message):
     given = cell(2, mount=mount)
@@ -83,7 +86,7 @@ def unchanged(values):
 @pytest.mark.parametrize(
     ("of_poses", "of_detections", "mount", "message"),
     [
-        (unchanged, unchanged, "bench", "camera on the other mount"),
+        (unchanged, unchanged, "bench", "--direction base-to-flange, or the camera on the other"),
         (unchanged, larger, "hand", r"squares \(they may be 1\.2\d+ times"),
         (lambda T: T[:1].repeat(20, 0), unchanged, "hand", "the robot rotates by 0"),
         (
@@ -118,6 +121,42 @@ def test_good_poses_with_two_outliers_pass(cell, tmp_path, seed):
     given = cell(seed)
     given.T_base_flange[:2, :3, 3] += 0.03
     check(given, write(tmp_path / "poses.csv", given.T_base_flange), PoseFormat(), "hand")
+
+
+T_FLANGE_CAM = make_transform(np.eye(3), np.array([0.05, 0.06, 0.04]))
+
+
+def rotating(given, shifts):
+    """Replace poses and images: the flange rotates about its origin at ``shifts``."""
+    rng, board = np.random.default_rng(0), parse_board("charuco:9x7:25:18")
+    down = np.diag([1.0, -1.0, -1.0])
+    turns = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, (20, 3))).as_matrix()
+    given.T_base_flange = make_transform(down @ turns, shifts + np.array([0, 0, 0.5]))
+    T_base_board = make_transform(down, -down @ board.points.mean(axis=0))
+    T_cam_board = np.linalg.inv(given.T_base_flange @ T_FLANGE_CAM) @ T_base_board
+    given.detections = [
+        take(board, T, given.camera, f"{number:02d}.png", 0.1, rng)
+        for number, T in enumerate(T_cam_board)
+    ]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-6, 1e-4])
+def test_a_flange_that_only_rotates_about_its_origin_determines_no_scale(cell, tmp_path, jitter):
+    given = cell(2)
+    rotating(given, jitter * np.random.default_rng(1).normal(size=(20, 3)))
+    path = write(tmp_path / "poses.csv", given.T_base_flange)
+    flanges = check(given, path, PoseFormat(), "hand")
+    calibration = calibrate_hand_eye(flanges, given.boards, "hand")
+    assert np.allclose(calibration.T_mount_cam, T_FLANGE_CAM, atol=0.001)
+
+
+def test_a_few_poses_elsewhere_determine_the_scale(cell, tmp_path):
+    given = cell(2)
+    rotating(given, np.repeat([[0.0, 0.0, 0.0], [0.15, 0.1, 0.0]], [15, 5], axis=0))
+    given.detections = larger(given.detections)
+    path = write(tmp_path / "poses.csv", given.T_base_flange)
+    with pytest.raises(UserError, match=r"squares \(they may be 1\.2\d+ times"):
+        check(given, path, PoseFormat(), "hand")
 
 
 def test_leave_one_out_finds_the_pose_with_the_largest_influence(cell):
