@@ -41,7 +41,7 @@ FORMAT: Final = (
     "(and the image's name)"
 )
 
-Record = Mapping[object, object]
+Record = Mapping[str, object]  # by the field's name in lower case
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,8 @@ def read_robot_poses(path: Path) -> RobotPoses:
     if not records:
         raise UserError(f"{path} without a pose", FORMAT, "write one record per pose")
     names = tuple(
-        next((str(record[key]) for key in NAMES if record.get(key)), "") for record in records
+        next((str(record[key]) for key in NAMES if record.get(key) not in (None, "")), "")
+        for record in records
     )
     if "matrix" in records[0]:
         matrices = ({"matrix": record.get("matrix")} for record in records)
@@ -111,8 +112,8 @@ def read_robot_poses(path: Path) -> RobotPoses:
         )
         rotations = T[:, :3, :3].reshape(-1, 9)
         return RobotPoses(names, T[:, :3, 3], "matrix", rotations, str(path))
-    fields = {str(field).strip().lower() for field in records[0]}
-    kind = next((kind for kind, needed in ROTATIONS.items() if set(needed) <= fields), None)
+    fields = records[0].keys()
+    kind = next((kind for kind, needed in ROTATIONS.items() if {*needed} <= fields), None)
     if kind is None or not {"x", "y", "z"} <= fields:
         problem = f"{path} with the columns {', '.join(sorted(fields))[:200]}"
         raise UserError(problem, FORMAT, "rename the columns to these names")
@@ -147,11 +148,18 @@ def _read_csv(path: Path) -> list[Record]:
         allowed = f"a readable CSV file of at most {MAX_BYTES / 1e6:g} MB"
         fix = "pass the path of a CSV file in UTF-8"
         raise UserError(f"{path}: {error!s:.200}", allowed, fix) from error
-    return [{str(key).strip().lower(): value for key, value in row.items()} for row in rows]
+    return [_with_lower_keys(row) for row in rows]
+
+
+def _with_lower_keys(record: Mapping[Any, object]) -> Record:
+    return {str(key).strip().lower(): value for key, value in record.items()}
 
 
 def _records(content: object, path: Path) -> list[Record]:
-    """Return the records in parsed JSON or YAML: a list, or a mapping from image names."""
+    """Return the records in parsed JSON or YAML: a list, or a mapping from image names.
+
+    Names of fields are converted to lower case.
+    """
     if isinstance(content, Mapping):
         content = [
             {"name": name, **record} if isinstance(record, Mapping) else record
@@ -159,7 +167,7 @@ def _records(content: object, path: Path) -> list[Record]:
         ]
     if not isinstance(content, list) or not all(isinstance(item, Mapping) for item in content):
         raise UserError(f"{path}: not a list of records", FORMAT, "write one record per pose")
-    return content
+    return [_with_lower_keys(item) for item in content]
 
 
 def _numbers(

@@ -89,6 +89,21 @@ def test_poses_are_paired_with_their_images(tmp_path):
         match_images(read_robot_poses(path), ["a.png", "b.png"])
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("p.json", '[{"Name": "1", "X": 1, "Y": 2, "Z": 3, "RX": 0, "RY": 0, "RZ": 0},'
+         '{"Name": 0, "X": 1, "Y": 2, "Z": 3, "RX": 0, "RY": 0, "RZ": 0}]'),
+        ("p.yaml", "1: {x: 1, y: 2, z: 3, rx: 0, ry: 0, rz: 0}\n"
+         "0: {x: 1, y: 2, z: 3, rx: 0, ry: 0, rz: 0}\n"),
+    ],
+)  # fmt: skip
+def test_names_may_be_numbers_and_fields_in_capitals(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    pairs = match_images(read_robot_poses(tmp_path / name), ["0.png", "1.png"])
+    assert pairs == {"1.png": 0, "0.png": 1}
+
+
 def test_touched_points_need_named_columns_of_any_separator(tmp_path):
     path = tmp_path / "points.csv"
     path.write_text("x;y;z\n1;2;3\n")
