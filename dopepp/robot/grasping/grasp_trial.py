@@ -23,6 +23,7 @@ from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.outline import OutlineMesh, make_outline_mesh
 from dopepp.parts.catalogue import load_part
+from dopepp.parts.symmetry_finder import cached_symmetries
 from dopepp.robot.grasping.cell import HOME, JOINTS, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
 from dopepp.robot.grasping.grasps import TILTS, find_grasps
@@ -112,7 +113,8 @@ class Record:
     off: float  # error added to an exact pose, millimetres and degrees
     seen: bool  # whether the pose source returned a pose; if not, errors are NaN
     recognised: bool  # whether ADD was below a tenth of the part's diameter
-    # Errors include calibration errors, and are measured before the alignment with the bench.
+    # Errors include calibration errors, and are measured before the alignment with the bench, to
+    # the part's nearest pose up to its symmetries.
     add_mm: float  # ADD
     error_mm: float  # of the part's origin
     error_deg: float
@@ -188,8 +190,8 @@ class Trials:
         self.arm, self.gripper = Arm(), measure_gripper()
         self.tip = np.array([0.0, 0.0, self.gripper.reach(0.0)])
         self.distance = DEFAULT_DISTANCE if task.network is None else self._trained_distance()
-        part = self.part
-        self._symmetries = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        assert self.part.mesh is not None  # as a layout requires it
+        self._symmetries = symmetry_group(*cached_symmetries(self.part.mesh))
         self._raster = RasterView(task.renderer == "raster-shadows")
         self.robot = cache(self._robot)
         # Scenes of equal numbers of parts share their models.
@@ -420,8 +422,9 @@ class Trials:
         if estimate is None:
             nan = float("nan")
             return Record(*trial, False, False, nan, nan, nan, False, "not seen", *ends, **counts)
-        adds = [self._add(estimate, target) for target in scene.targets]
-        add, target = min(adds), scene.targets[int(np.argmin(adds))]
+        targets = [target @ S for target in scene.targets for S in self._symmetries]
+        adds = [self._add(estimate, target) for target in targets]
+        add, target = min(adds), targets[int(np.argmin(adds))]
         shift = float(np.linalg.norm(estimate[:3, 3] - target[:3, 3]))
         angle = float(np.degrees(rotation_angle(estimate[:3, :3].T @ target[:3, :3])))
         is_recognised = bool(add < RECOGNISED * self.part.diameter)
@@ -440,12 +443,10 @@ class Trials:
         return Record(*trial, True, is_recognised, *pose, is_caught, failure, *ends, **counts)
 
     def _add(self, estimate: Transform, target: Transform) -> float:
-        """Return the smallest ADD over the part's symmetries, metres."""
-        points = transform(estimate, self.part.points)
-        return min(
-            float(np.linalg.norm(points - transform(target @ S, self.part.points), axis=1).mean())
-            for S in self._symmetries
-        )
+        """Return the ADD of an estimated pose, metres."""
+        points = self.part.points
+        shifts = transform(estimate, points) - transform(target, points)
+        return float(np.linalg.norm(shifts, axis=1).mean())
 
     def _aim_camera(self, robot: TrueRobot, rng: Generator) -> tuple[Joints, Transform]:
         """Sample a camera pose above the tray; return the measured joints and true T_base_cam."""

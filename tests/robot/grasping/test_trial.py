@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import make_transform
@@ -53,6 +54,23 @@ def test_a_wrong_or_missing_pose_is_a_failure(trials, scene, monkeypatch, shifts
     record = trials.attempt(scene, PoseSource("exact")).record
     assert (record.seen, record.caught, record.recognised, record.failure) == expected
     assert not shifts or record.error_mm == pytest.approx(50)
+
+
+def test_a_pose_is_correct_up_to_the_symmetries_of_the_part(tmp_path):
+    trimesh.creation.box((60, 40, 10)).export(tmp_path / "box.stl")
+    grasp = "{point: [0, 0, 0], closing: [0, 1, 0], approach: [0, 0, -1], width: 0.04}"
+    (tmp_path / "box.yaml").write_text(f"part: box\ngrasps: [{grasp}]\n")
+    trials = Trials(GraspTask(str(tmp_path / "box.stl"), "mm", tmp_path / "box.yaml"))
+    target = make_transform(np.eye(3), TRAY)
+    calibrated = SimpleNamespace(hand_eye_mm=0.0, hand_eye_deg=0.0)
+    scene = SimpleNamespace(number=0, attempt=1, parts=[0], targets=[target], calibrated=calibrated)
+    observation = SceneObservation([], HOME)
+    for half_turn in np.array([[-1, -1, 1], [1, -1, -1], [-1, 1, -1]]):
+        estimate = target @ make_transform(np.diag(half_turn), np.zeros(3))
+        record = trials._record(scene, PoseSource("exact"), observation, estimate, None)
+        errors = record.add_mm, record.error_mm, record.error_deg
+        assert record.recognised
+        assert np.allclose(errors, 0, atol=1e-3)
 
 
 class Attempts(Trials):
