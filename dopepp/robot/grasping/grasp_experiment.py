@@ -120,6 +120,7 @@ def make_experiment(
         if done % BLOCK == 0:
             first = [record for record in records if record.source == task.sources[0].name]
             report_progress(f"{done} of {count}: {count_records(first).caught} caught")
+    records.sort(key=lambda record: record.number)  # processes finish trials in any order
     facts = _facts(task, records, time.monotonic() - start)
     write_report(folder, records, facts)
     if all(record.failure == "no plan" for record in records):

@@ -93,6 +93,17 @@ def test_two_processes_and_one_process_run_equal_trials(trials):
     assert [record for (record,) in records] == expected
 
 
+def test_films_and_facts_are_of_the_first_trial(monkeypatch, tmp_path):
+    """Processes may finish the trials in any order."""
+    trials = [[replace(record(number), second_view=f"{number}")] for number in (2, 0, 1)]
+    shown = []
+    monkeypatch.setattr(grasp_experiment, "run_trials", lambda *_: iter(trials))
+    monkeypatch.setattr(grasp_experiment, "show", lambda task, records, *_: shown.extend(records))
+    report = grasp_experiment.make_experiment(TASK, 3, 2, tmp_path, None, None, print)
+    assert "- second view, first trial: 0\n" in report
+    assert [record.number for record in shown] == [0, 1, 2]
+
+
 def test_a_lost_process_ends_the_experiment_in_one_line(monkeypatch):
     class Lost(ProcessPool):
         def submit(self, item):
