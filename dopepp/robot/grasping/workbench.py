@@ -108,7 +108,8 @@ class Layout:
     def distractors(self, rng: Generator) -> list[PlacedBody]:
         """Sample a part and 2 to 4 distractors whose bounding circles do not overlap."""
         solids = self.single(rng)
-        occupied = [(solids[0].T_base_obj[:3, 3], self.part.diameter / 2)]
+        centre = transform(solids[0].T_base_obj, self.part.cuboid[-1])
+        occupied = [(centre, self.part.diameter / 2)]
         shapes = distractor_shapes()
         for _ in range(int(rng.integers(DISTRACTORS[0], DISTRACTORS[1] + 1))):
             radius = rng.uniform(*DISTRACTOR_RADIUS)

@@ -13,6 +13,7 @@ from dopepp.geometry.camera import invert_transform, make_transform, project_key
 from dopepp.parts import convex
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.convex import convex_pieces
+from dopepp.parts.part import make_part
 from dopepp.robot.grasping.cell import TRAY, Cell
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K, downward_view
 from dopepp.robot.grasping.workbench import HEAP, LAYOUTS, SPREAD, Layout, RasterView
@@ -95,14 +96,18 @@ def test_a_part_that_never_rests_makes_no_heap(part, monkeypatch):
         Layout(part, "heap", 180.0, "front").draw(np.random.default_rng(0))
 
 
-def test_distractors_keep_clear_of_the_part(part):
+@pytest.mark.parametrize("shift", [0.0, 0.08])
+def test_distractors_keep_clear_of_the_part(part, shift):
+    """Also if the part's origin is far from its centre."""
+    moved = replace(part.mesh, vertices=part.mesh.vertices + shift)
+    part = make_part("part", moved)
     layout = Layout(part, "distractors", yaw_deg=0.0, rest="front")
     for seed in range(10):
         first, *others = layout.draw(np.random.default_rng(seed))
         middle = (first.T_base_obj @ [*part.cuboid[-1], 1.0])[:2]
         assert np.linalg.norm(middle - TRAY[:2]) <= SPREAD + 1e-9
         for item in others:
-            distance = np.linalg.norm(item.T_base_obj[:2, 3] - first.T_base_obj[:2, 3])
+            distance = np.linalg.norm(item.T_base_obj[:2, 3] - middle)
             assert distance > part.diameter / 2
 
 
