@@ -18,10 +18,13 @@ def image_names(folder: Path) -> list[str]:
     """Return the file names of a folder's images in natural order: 10 after 9.
 
     Raises:
-        UserError: The folder has no images.
+        UserError: The path is not a folder, or the folder has no images.
     """
     from dopepp.inference.frames.media import list_images
 
+    if not folder.is_dir():
+        fix = "pass the path of an existing folder"
+        raise UserError(f"{folder}, which is not a folder", "a folder with images", fix)
     return [path.name for path in list_images(folder) or ()]
 
 

@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dopepp.cli.board_images import image_names
-from dopepp.core.errors import RunError
+from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
@@ -166,6 +166,9 @@ def test_images_are_in_the_order_of_their_numbers(tmp_path):
     for name in ("10.png", "9.png"):
         (tmp_path / name).touch()
     assert image_names(tmp_path) == ["9.png", "10.png"]
+    for path in (tmp_path / "9.png", tmp_path / "none"):
+        with pytest.raises(UserError, match=f"{path.name}, which is not a folder"):
+            image_names(path)
 
 
 def test_images_without_the_board_are_an_error(run, cell, tmp_path):
