@@ -244,6 +244,8 @@ class _Node:
             return ""
         topics = " and ".join(camera.topic for camera in self._cameras)
         lag, limit = 1e3 * (pairing.lag_s or 0.0), 1e3 * pairing.max_lag_s
+        if lag <= limit:
+            return f"stamps on {topics} do not increase: let the drivers set header.stamp"
         return (
             f"stamps on {topics} differ by {lag:.1f} ms, and --lag allows {limit:.1f} ms: trigger "
             "the cameras together, synchronise their clocks, or raise --lag"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dopepp.robot.nodes import image_queue
-from dopepp.robot.nodes.image_queue import Pace, Slot
+from dopepp.robot.nodes.image_queue import Pace, Slot, StampPairing
 from dopepp.robot.nodes.messages import diagnosis, image_fields
 from dopepp.robot.nodes.ros2 import _Node, native
 from dopepp.robot.nodes.worker import Worker, WorkerSettings
@@ -25,6 +25,25 @@ def test_messages_are_converted_to_native_messages():
     image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     data = native("sensor_msgs/Image", image_fields(image, {})).data
     np.testing.assert_array_equal(np.frombuffer(data, np.uint8).reshape(2, 4, 3), image)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "problem"),
+    [
+        ([(0.0, 0.0)] * 20, "stamps on /left and /right do not increase: let the drivers set"),
+        ([(k, k + 0.05) for k in range(20)], "stamps on /left and /right differ by"),
+        ([(k, k + 0.01) for k in range(20)], ""),
+    ],
+)
+def test_images_that_form_no_sets_are_a_problem_with_a_remedy(stamps, problem):
+    pairing = StampPairing(2)
+    for pair in stamps:
+        for camera, stamp in enumerate(pair):
+            pairing.add(camera, stamp, None)
+    cameras = [SimpleNamespace(topic=topic) for topic in ("/left", "/right")]
+    text = _Node._pairing_problem(SimpleNamespace(_pairing=pairing, _cameras=cameras))
+    assert text.startswith(problem)
+    assert bool(text) == bool(problem)
 
 
 def test_parameters_change_while_the_node_runs(estimator, tmp_path):
