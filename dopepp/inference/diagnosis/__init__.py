@@ -47,10 +47,10 @@ CLIPPED, CLIPPED_PART = 0.25, 0.15
 # pixels (1.1 to 2) is harmless. At a blur of five (3.2 to 4.7), a quarter of the parts is missed.
 MAX_EDGE_WIDTH: Final = 2.5
 
-# K is reported as wrong if a focal length that differs by the factor FOCAL reduces the keypoint
-# error by the factor GAIN, and the standard deviation of its logarithm is below CERTAIN. The error
-# is reduced by a factor of 0.9 to 2.3 if K is correct. If the focal length is wrong by a factor of
-# 2, the error is reduced by a factor of 3 to 20 on a third of the images.
+# K is reported as wrong if a focal length that differs by the factor FOCAL reduces the robust
+# squared error of the keypoints by the factor GAIN, and the standard deviation of its logarithm is
+# below CERTAIN. The factor is 0.9 to 2.3 if K is correct. If the focal length is wrong by a factor
+# of 2, the factor is 3 to 20 on a third of the images.
 FOCAL, GAIN, CERTAIN = 1.35, 3.0, 0.2
 
 # Belief at a part's centre from which the part is partly visible: 0.4 to 0.8 for half-occluded
