@@ -99,7 +99,7 @@ def read_robot_poses(path: Path) -> RobotPoses:
     if not records:
         raise UserError(f"{path} without a pose", FORMAT, "write one record per pose")
     names = tuple(
-        next((str(record[key]) for key in NAMES if record.get(key) not in (None, "")), "")
+        next((str(record[key]).strip() for key in NAMES if record.get(key) not in (None, "")), "")
         for record in records
     )
     if "matrix" in records[0]:

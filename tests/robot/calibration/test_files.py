@@ -92,6 +92,7 @@ def test_poses_are_paired_with_their_images(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text"),
     [
+        ("p.csv", "X, Y, Z, RX, RY, RZ, Name\n1, 2, 3, 0, 0, 0, 1\n1, 2, 3, 0, 0, 0, 0 \n"),
         ("p.json", '[{"Name": "1", "X": 1, "Y": 2, "Z": 3, "RX": 0, "RY": 0, "RZ": 0},'
          '{"Name": 0, "X": 1, "Y": 2, "Z": 3, "RX": 0, "RY": 0, "RZ": 0}]'),
         ("p.yaml", "1: {x: 1, y: 2, z: 3, rx: 0, ry: 0, rz: 0}\n"
