@@ -45,9 +45,12 @@ def benchmark(
     if (image is None) != (intrinsics is None):
         fix = "pass --image FILE --K FX FY CX CY, or leave out both"
         raise UserError("only one of --image and --K", "both or neither", fix)
-    rows = []
+    rows, with_mesh = [], any(map(options.is_mesh, models))
     for path in models:
-        estimator = options.load_estimator(path, device, unit, working_distance, tilt)
+        # With checkpoints and meshes, these options apply to the meshes.
+        skips = with_mesh and not options.is_mesh(path)
+        of_mesh = (None, None, None) if skips else (unit, working_distance, tilt)
+        estimator = options.load_estimator(path, device, *of_mesh)
         if image is not None and intrinsics is not None:
             images = [(read_photo(image), camera_matrix(*intrinsics))]
         elif not isinstance(estimator, NetworkEstimator):

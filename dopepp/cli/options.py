@@ -64,6 +64,14 @@ Tilt = Annotated[
 Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
 
 
+def is_mesh(model: Path) -> bool:
+    """Return whether a model is a mesh file or a built-in part, and not a checkpoint."""
+    from dopepp.parts.catalogue import BUILTIN
+    from dopepp.parts.mesh.read import READERS
+
+    return model.suffix.lower() in READERS or (str(model) in BUILTIN and not model.exists())
+
+
 def load_estimator(
     model: Path,
     device: str,
@@ -82,22 +90,20 @@ def load_estimator(
         UserError: The model is invalid, or an option does not apply to it.
     """
     from dopepp.inference.estimator import PoseEstimator
-    from dopepp.parts.catalogue import BUILTIN
-    from dopepp.parts.mesh.read import READERS
 
-    is_mesh = model.suffix.lower() in READERS or (str(model) in BUILTIN and not model.exists())
-    kind, other = ("mesh", "checkpoint") if is_mesh else ("checkpoint", "mesh")
+    by_mesh = is_mesh(model)
+    kind, other = ("mesh", "checkpoint") if by_mesh else ("checkpoint", "mesh")
     excluded = {
-        "--part": is_mesh and parts,
-        f"--device {device}": is_mesh and device != "cpu",
-        "--working-distance": not is_mesh and working_distance is not None,
-        "--tilt": not is_mesh and tilt is not None,
-        "--unit": not is_mesh and unit is not None and not parts,
+        "--part": by_mesh and parts,
+        f"--device {device}": by_mesh and device != "cpu",
+        "--working-distance": not by_mesh and working_distance is not None,
+        "--tilt": not by_mesh and tilt is not None,
+        "--unit": not by_mesh and unit is not None and not parts,
     }
     for option in (option for option, is_given in excluded.items() if is_given):
         problem = f"{option} with the {kind} {model}"
         raise UserError(problem, f"{option} with a {other}", f"leave out {option}")
-    if not is_mesh:
+    if not by_mesh:
         return PoseEstimator.load(model, device, max_ms=max_ms, scale_error=scale_error)
     distances, tilt_deg = distance_range(working_distance), 180.0 if tilt is None else tilt
     return PoseEstimator.from_mesh(

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from dopepp.cli import network_commands
+from dopepp.inference import benchmark
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.network import build_network
 from dopepp.models.storage import write_atomic
@@ -52,6 +54,18 @@ def test_the_benchmark_refines_by_region_only(refused, checkpoint):
     assert "--refine depth; allowed: region" in refused(
         "benchmark", checkpoint, "--refine", "depth"
     )
+
+
+def test_the_benchmark_compares_a_checkpoint_with_a_mesh(run, image_file, monkeypatch):
+    loaded = []
+    step = np.ones(2)
+    monkeypatch.setattr(
+        network_commands.options, "load_estimator", lambda path, *given: loaded.append(given)
+    )
+    monkeypatch.setattr(benchmark, "time_frames", lambda *_: benchmark.Timing(1, step, {}, 1))
+    words = ("best.ckpt", "part.stl", "--image", image_file, *K)
+    run("benchmark", *words, "--unit", "mm", "--working-distance", "0.3,0.5", "--tilt", 60)
+    assert loaded == [("cpu", None, None, None), ("cpu", "mm", "0.3,0.5", 60)]
 
 
 @pytest.mark.parametrize(
