@@ -81,9 +81,9 @@ def calibrate_hand_eye(
     inliers = np.ones(len(M), bool)
     robot = np.array(ROBOT_NOISE)
     for _ in range(4):
-        X, Y, covariance = refine(M[inliers], B[inliers], B_cov[inliers], X, Y, robot)
+        X, Y, covariance = refine(M[inliers], B[inliers], B_cov[inliers], X, Y, robot, mount)
         robot = _robot_noise(_residuals(M, B, X, Y)[inliers], B_cov[inliers])
-        distances = _distances(M, B, B_cov, X, Y, robot)
+        distances = _distances(M, B, B_cov, X, Y, robot, mount)
         scale = max(1.0, float(np.median(distances[inliers])) / MEDIAN_CHI2)
         inliers = distances <= OUTLIER * scale
         if inliers.sum() < MIN_POSES:
@@ -147,13 +147,19 @@ def relative_motions(M: Transforms, B: Transforms) -> tuple[Transforms, Transfor
 
 
 def refine(
-    M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
+    M: Transforms,
+    B: Transforms,
+    B_cov: Covariances,
+    X: Transform,
+    Y: Transform,
+    robot: Noise,
+    mount: Mount,
 ) -> tuple[Transform, Transform, Float[np.ndarray, "6 6"]]:
     """Refine X and Y of M_i X B_i = Y by least squares with a soft L1 loss.
 
     ``B_cov`` are the covariances of B. Returns X, Y, and the covariance of X (:class:`HandEye`).
     """
-    whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, B_cov, robot)))
+    whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, B_cov, robot, mount)))
 
     def residuals(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, "numbers"]:
         moved = move_pose(np.stack([X, Y]), step.reshape(2, 6))
@@ -176,15 +182,17 @@ def _residuals(M: Transforms, B: Transforms, X: Transform, Y: Transform) -> Resi
 
 
 def _covariances(
-    M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise
+    M: Transforms, X: Transform, Y: Transform, B_cov: Covariances, robot: Noise, mount: Mount
 ) -> Covariances:
     """Return the covariances of :func:`_residuals`: ``B_cov`` plus the propagated robot noise."""
-    # Derivative of the board's pose by the robot's, which rotates about the mount's origin.
-    to_cam = X[:3, :3].T
+    # Derivative of the board's pose by the robot's, which rotates about the flange's origin.
+    to_cam, T_mount_other = X[:3, :3].T, np.linalg.inv(M)
     jacobian = np.zeros((len(M), 6, 6))
     jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = to_cam
-    shifts = (np.linalg.inv(M) @ Y)[:, None, :3, 3]
-    jacobian[:, 3:, :3] = -to_cam @ np.cross(np.eye(3), shifts)  # matrices of v ↦ shift × v
+    shifts = (T_mount_other @ Y)[:, :3, 3]  # from the flange's origin to the board's
+    if mount == "bench":
+        shifts = shifts - T_mount_other[:, :3, 3]
+    jacobian[:, 3:, :3] = -to_cam @ np.cross(np.eye(3), shifts[:, None])  # of v ↦ shift × v
     variances = np.diag(np.repeat(robot**2, 3))
     return np.asarray(B_cov + jacobian @ variances @ jacobian.transpose(0, 2, 1))
 
@@ -200,9 +208,17 @@ def _robot_noise(residuals: Residuals, B_cov: Covariances) -> Noise:
 
 
 def _distances(
-    M: Transforms, B: Transforms, B_cov: Covariances, X: Transform, Y: Transform, robot: Noise
+    M: Transforms,
+    B: Transforms,
+    B_cov: Covariances,
+    X: Transform,
+    Y: Transform,
+    robot: Noise,
+    mount: Mount,
 ) -> Float[np.ndarray, "poses"]:
     """Return each board pose's squared Mahalanobis distance from X⁻¹ M⁻¹ Y, the expected pose."""
     residuals = _residuals(M, B, X, Y)
-    whole = np.linalg.solve(_covariances(M, X, Y, B_cov, robot), residuals[..., None])[..., 0]
+    whole = np.linalg.solve(_covariances(M, X, Y, B_cov, robot, mount), residuals[..., None])[
+        ..., 0
+    ]
     return np.asarray((residuals * whole).sum(axis=1))

@@ -270,7 +270,7 @@ def assess(
     for index in indices.tolist():
         rest = indices[indices != index]
         noise = np.array(calibration.robot_noise)
-        without, _, _ = refine(M[rest], B[rest], B_cov[rest], X, Y, noise)
+        without, _, _ = refine(M[rest], B[rest], B_cov[rest], X, Y, noise, calibration.mount)
         changes[index] = np.linalg.norm(without[:3, 3] - X[:3, 3])
     reasons = tuple(text for text, applies in findings.items() if applies)
     return CalibrationQuality(shift, rotation, changes, diversity, next_pose, reasons)

@@ -52,6 +52,17 @@ def test_the_error_of_the_camera_is_below_a_millimetre_and_fits_its_covariance(c
     assert 0.4 < np.mean(squares) < 2.5
 
 
+def test_the_camera_on_the_bench_does_not_depend_on_the_base_frame(cell):
+    given, moved = cell(3, mount="bench"), np.eye(4)
+    moved[:3, 3] = [1.0, -0.5, 0.3]
+    first, second = (
+        calibrate_hand_eye(T @ given.T_base_flange, given.boards, "bench")
+        for T in (np.eye(4), moved)
+    )
+    assert np.allclose(second.T_mount_cam, moved @ first.T_mount_cam, atol=1e-6)
+    assert np.allclose(second.covariance, first.covariance, rtol=1e-3, atol=0)
+
+
 def test_poses_that_contradict_the_others_are_rejected(cell):
     given = cell(5)
     given.T_base_flange[3, :3, 3] += [0.02, 0, 0]
