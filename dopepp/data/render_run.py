@@ -113,7 +113,11 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Parse ``i/n`` with i from 0 to n − 1; another text is a UserError."""
+        """Parse ``i/n`` with i from 0 to n − 1.
+
+        Raises:
+            UserError: The text has another form, or i is not below n.
+        """
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if match is None or int(match[1]) >= int(match[2]):
             allowed = "i/n with 0 <= i < n: 0/2 and 1/2 are the two halves"

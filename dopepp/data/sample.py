@@ -196,7 +196,7 @@ def reduce_visibility(
 
 
 class Purpose(IntEnum):
-    """Purpose of a random generator; its number enters the seed, so it must not change."""
+    """Purpose of a random generator; the numbers enter the seed, so they must not change."""
 
     SHUFFLE = 101
     MIX = 102

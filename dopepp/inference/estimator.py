@@ -70,8 +70,8 @@ class PoseEstimator(ABC):
         max_ms: Time limit for the refinement of an image, milliseconds. The best detections are
             refined first; detections beyond the limit keep their start pose.
         scale_error: Largest relative error of the parts' size or of the focal length (default:
-            0.005). If the network's distance is certain, refinement changes it by the remaining
-            difference only. Choose a small value for a calibrated camera and a measured part.
+            0.005). Differences up to this error do not change a certain distance. Choose a small
+            value for a calibrated camera and a measured part.
 
     Raises:
         UserError: The refinement is unknown, or a part has no mesh.

@@ -1,9 +1,9 @@
 """Sizes of an image in which the network runs, and detections in these sizes.
 
 A network detects a part in a limited range of sizes. A part of diameter d at depth z is d·f/z
-pixels long in an image of focal length f; in training, from ``smallest_px`` to ``largest_px``. The
-image is resized so that parts at the expected distances have sizes in this range. If the distances
-vary more than in training, the network runs on the image in several sizes.
+pixels long in an image of focal length f. In training, the length was ``smallest_px`` to
+``largest_px``. The image is resized so that parts at the expected distances have lengths in this
+range. If the distances vary more than in training, the network runs on the image in several sizes.
 """
 
 from __future__ import annotations
@@ -160,11 +160,11 @@ def letterboxes(
 def _further_letterbox(
     checkpoint: Checkpoint, image: RGBImage, K: CameraMatrix, boxes: Sequence[Letterbox]
 ) -> Letterbox | None:
-    """Return the size of training images; None if it shows nothing that ``boxes`` do not show.
+    """Return the size of training images; None if it would give no further detections.
 
-    With a longer focal length than in training, it shows farther parts at a trained size, and with
-    a shorter focal length or a wider image nearer parts. The windows that a network was trained on
-    are often much smaller than the image. At their size, even the nearest part is too small.
+    In this size, parts at other distances than the trained distances may have a trained size. None
+    is returned if ``boxes`` include the size, or if even the nearest part is too small in it. The
+    latter is usual for networks that were trained on small windows of large images.
     """
     learned = Letterbox.fit((image.shape[1], image.shape[0]), checkpoint.input_size)
     is_shown = any(1 / MARGIN < box.scale_x / learned.scale_x < MARGIN for box in boxes)

@@ -315,7 +315,7 @@ class TemplateEstimator(PoseEstimator):
         return [Reason(name, "empty", 0.0, text) for name in names]
 
     def _range(self, distances: Distances | None) -> tuple[float, float]:
-        """Return the depths to search: the given ones, or else the working distance."""
+        """Return the depths to search: ``distances`` or, by default, the working distance."""
         if distances is None or distances == "any":
             return self.distances
         return check("distances", distances, tuple[float, float], METRES)
@@ -334,9 +334,10 @@ def _refined_again(
 
 
 def _check_size(part: Part, distances: tuple[float, float]) -> None:
-    """Raise a UserError if the part has another order of magnitude than the distances.
+    """Check that the unit of the mesh and that of the distances can both be correct.
 
-    Then the unit of the mesh or that of the distances is wrong.
+    Raises:
+        UserError: The distances are below or above the plausible multiples of the diameter.
     """
     nearest, farthest = (distance / part.diameter for distance in distances)
     if nearest > MAX_DIAMETERS or farthest < MIN_DIAMETERS:

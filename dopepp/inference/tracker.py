@@ -54,7 +54,7 @@ Item = TypeVar("Item")  # type of a detection: in a camera, or in the world
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Generic[Item]):
-    """Detection with the values by which it is tracked."""
+    """Detection with its pose, covariance and agreement in the frame in which it is tracked."""
 
     detection: Item
     object: str  # name of the part
@@ -85,7 +85,7 @@ class _State(Generic[Item]):
     detected: bool = True  # whether the last pose came from the network's detection
     unseen: int = 0  # frames since the part was lost
     doubts: int = 0  # frames in a row with less than the usual agreement
-    disagreements: int = 0  # detections in a row that were elsewhere
+    disagreements: int = 0  # detections in a row whose pose differs from the tracked pose
 
     def move_to(self, estimate: Estimate[Item], motion: Motion) -> None:
         """Continue from a detection of the network, at rest."""
@@ -140,7 +140,7 @@ class Tracker(ABC, Generic[Item]):
     def _moved(
         self, estimate: Estimate[Item], forecast: Motion, agreement: float
     ) -> Estimate[Item]:
-        """Return a part at its predicted pose; ``agreement`` is that of a rejected pose."""
+        """Return a part at its predicted pose, with the ``agreement`` of the rejected pose."""
 
     @abstractmethod
     def _detected(self, near: Sequence[Estimate[Item]] | None) -> list[Estimate[Item]]:

@@ -178,7 +178,11 @@ class Part:
 
     @classmethod
     def from_record(cls, record: object) -> Part:
-        """Create a part from a record of :meth:`to_record`; an invalid field is a UserError."""
+        """Create a part from a record of :meth:`to_record`.
+
+        Raises:
+            UserError: A field is invalid.
+        """
         values = parse(_Record, record, "part", _FIX)
         cuboid = np.array(values.cuboid, np.float64)
         expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))

@@ -62,7 +62,11 @@ class LearnedRange(NamedTuple):
 
     @classmethod
     def parse(cls, values: object) -> LearnedRange:
-        """Convert a list of the four values in a checkpoint; raise a UserError for another one."""
+        """Convert a list of the four values in a checkpoint.
+
+        Raises:
+            UserError: The value is not a list of four numbers within their limits.
+        """
         limits = "the learned range of sizes"
         four = check(limits, values, tuple[float, float, float, float], Range(1e-4, 1e5))
         sizes = check("sizes of a part", four[:2], tuple[float, float], Span(*_SIZES, "pixels"))

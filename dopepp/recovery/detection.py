@@ -82,8 +82,8 @@ class Detection:
             the refined pose (:mod:`dopepp.inference.refinement.verification`); None without
             refinement by region.
         start: Pose and covariance from which refinement started; None without refinement.
-        alternative: Further hypothesis of the same instance, found by :mod:`~.search`. Refinement
-            tries it if the first pose is probably wrong, and keeps it if it is probably right.
+        alternative: Detection of the same instance at the pose of :mod:`~.search`. It is refined if
+            the refined first pose is improbable, and replaces the first pose if it is probable.
     """
 
     object: str
@@ -120,9 +120,7 @@ class RecoveryOptions:
             centroid, degrees.
         max_peaks: Maximum number of peaks per channel.
         min_score: Smallest score of a detection. The default is for the mean belief of untuned
-            networks: the highest multiple of 0.05 that keeps 90 % of the correct detections (mean
-            of five networks) on one half of the frames. On the other half it kept 94 % of the
-            correct and 6 % of the false detections.
+            networks.
         distance_factor: Factor on the distance of every pose, set by ``evaluate.py tune=true``.
         covariance_factor: Factor on the covariance of every pose, set by ``tune=true``.
         score_bias, score_belief, score_spread, score_misfit, score_found: Weights of the score's

@@ -44,7 +44,7 @@ class FileSource(Protocol):
     """Source that lists its files, so that a cache on disk is not reused for changed files."""
 
     def files(self) -> Iterable[Path]:
-        """Return the annotations, images and masks that determine the samples; some may lack."""
+        """Return the annotations, images and masks of the samples; some files may not exist."""
 
 
 def hash_files(paths: Iterable[Path], root: Path) -> str:

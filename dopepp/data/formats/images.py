@@ -83,7 +83,11 @@ def header_shape(file: Path | io.BytesIO) -> Shape | None:
 
 
 def decode_rgb(content: bytes, where: str) -> RGBImage:
-    """Decode a colour or grey image of 8 bits as RGB; another image is a UserError."""
+    """Decode a colour or grey image of 8 bits as RGB.
+
+    Raises:
+        UserError: The image is damaged, too large, or of another type.
+    """
     image = decode_image(Node(STRICT, where), content, COLOUR_MODES)
     assert image is not None
     return np.array(image.convert("RGB"))
@@ -105,7 +109,11 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
 
 
 def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
-    """Decode a mask of ``shape``; the object's pixels are not 0. Other images raise a UserError."""
+    """Decode a mask of ``shape``; the object's pixels are not 0.
+
+    Raises:
+        UserError: The image is damaged, or of another size or type.
+    """
     mask = decode_one_channel(Node(STRICT, where), shape, content)
     assert mask is not None
     return np.asarray(mask != 0)

@@ -36,7 +36,7 @@ class BackgroundCrops:
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
     def draw(self, size: Shape, rng: Generator) -> RGBImage | None:
-        """Return a crop of (height, width), halved until there is one with contrast, or None."""
+        """Return a crop of (height, width), halved until a crop has several colours, or None."""
         height, width = size
         while True:
             crop = self._draw((height, width), rng)

@@ -258,8 +258,8 @@ def diagnose(case: Case) -> list[Diagnosis]:
 def _lens_ratio(case: Case) -> float | None:
     """Return the ratio of K's and training's focal lengths if it explains a wrong distance.
 
-    It does not if the part's distance lies within the training range, its size on the image does
-    not, or the focal lengths hardly differ.
+    None if the part's distance is in the training range, if its size in pixels is outside the
+    training range, or if the focal lengths hardly differ.
     """
     if case.seen is None or case.distances is not None or case.detection is None:
         return None

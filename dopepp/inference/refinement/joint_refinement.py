@@ -228,7 +228,7 @@ class _ViewSearch:
         self._depth = [evidence.term(evidence.visible(self._start.T_cam_obj))]
 
     def round(self, left: int) -> Round:
-        """Return the round with ``left - 1`` rounds after it; the first if there are too few."""
+        """Return the ``left``-th round from the end, or the first round if there are fewer."""
         return self.rounds[max(0, len(self.rounds) - left)]
 
     def learn(self, T_world_obj: Transform, left: int) -> bool:

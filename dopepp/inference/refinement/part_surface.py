@@ -233,7 +233,7 @@ def nearest_zero(mask: Array) -> tuple[Array, Array]:
 
 @compiled()
 def _hide(posed: SurfacePoints, rays: Array, grid: _Grid, is_visible: Array) -> None:
-    """Write which points are visible: those that fewer than two discs of other points hide.
+    """Mark a point as visible if fewer than two discs of other points hide it.
 
     Args:
         posed: Points of the posed part, camera frame.

@@ -1,10 +1,10 @@
 """Verification: the probability that a pose is correct, from the image at that pose.
 
 A pose is correct if ADD(-S) is below a tenth of the part's diameter. The features describe how well
-the part, drawn at the pose, explains the image: its outline, creases, colours and shading. No
-feature depends on a network, so a single small model serves all parts. It was learned from refined
-poses of procedural parts (``benchmarks/learn_verification.py``), and its numbers are in
-``verification.json``.
+the part, drawn at the pose, explains the image: its outline, creases, colours and shading. Except
+for ``moved``, no feature depends on a network, so a single small model serves all parts. The model
+was learned from refined poses of procedural parts (``benchmarks/learn_verification.py``), and its
+weights are in ``verification.json``.
 
 To add a feature, name it in :data:`EVIDENCE`, compute it in :meth:`Verifier.evidence`, and learn
 the model again.

@@ -65,7 +65,7 @@ class BopPoses:
         return BopPoses(*(values[selected] for values in vars(self).values()))
 
     def without_model(self, models: Collection[int]) -> Counter[int]:
-        """Count the objects whose number is not in ``models``; count none if that is empty."""
+        """Count the objects whose number is not in ``models``; 0 if ``models`` is empty."""
         ids = self.obj_ids[self.obj_ids >= 0].tolist()
         return Counter(number for number in ids if models and number not in models)
 

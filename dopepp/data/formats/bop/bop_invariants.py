@@ -1,7 +1,7 @@
 """Check that the records, models, masks and images of a BOP data set agree.
 
 The reader parses the records, and its problems are defects. Optional files (depth, masks) must
-exist for every image of a scene or for none. What every reader handles is noted.
+exist for every image of a scene or for none. Deviations that every reader handles are notes.
 """
 
 from __future__ import annotations

@@ -239,7 +239,7 @@ class Descent:
     reach: float  # search distance, pixels of the image
 
     def run(self, start: Transform) -> Solution:
-        """Descend in one round after the other from a start pose."""
+        """Descend from a start pose in all rounds, from coarse to fine."""
         end = Solution(start, self.prior.information)
         for stage in self.rounds:
             stage.learn(end.T_cam_obj, self.reach)
