@@ -75,8 +75,10 @@ def options_page() -> str:
         "An option is typed as `name=value` after `python train.py` or `python evaluate.py`; a "
         "group's choice as `group=choice`. `--cfg job` prints the whole configuration of a "
         "command; an option that it does not print needs a leading `+`, e.g. "
-        "`+trainer.num_nodes=2`. A unit in brackets, e.g. [metres], follows the meaning; two "
-        "numbers `[low,high]` are the range of a random value.",
+        "`+trainer.num_nodes=2`. A node is a class and its options, from a file of `conf/`, e.g. "
+        "`optimizer.lr` from `conf/optimizer/muon.yaml`; this page does not list these options. "
+        "A unit in brackets, e.g. [metres], follows the meaning; two numbers `[low,high]` are the "
+        "range of a random value.",
         "## Choices",
     ]
     for folder in sorted(path for path in (ROOT / "conf").rglob("*") if path.is_dir()):
@@ -86,6 +88,7 @@ def options_page() -> str:
             blocks += [f"### `{group}`", table(("Choice", "Meaning"), rows)]
     blocks.append("## `train.py`")
     blocks += option_blocks(RunConfig, train, "")
+    blocks.append("### `recovery`: RecoveryOptions")
     blocks.append(class_table(RecoveryOptions, train["recovery"], "recovery."))
     blocks.append("## `evaluate.py`")
     blocks.append("Every option of `data` and `virtual` as well, with the checkpoint's as default.")
@@ -158,7 +161,7 @@ def attributes(kind: type) -> dict[str, str]:
             r"^    ([\w, ]+): (.*(?:\n     .*)*)", section, re.MULTILINE
         ):
             text = _ROLE.sub(lambda role: f"`{role[1].rpartition('.')[2]}`", meaning)
-            text = re.sub(r"\s+", " ", text).replace("``", "`")
+            text = re.sub(r"\bNone\b", "`null`", re.sub(r"\s+", " ", text).replace("``", "`"))
             meanings |= {name.strip(): text for name in names.split(",")}
     return meanings
 

@@ -71,9 +71,9 @@ class VirtualConfig:
     """Options of the renders: the node ``virtual``.
 
     Attributes:
-        preset: Name of the scene preset (:mod:`dopepp.virtual.presets`); None selects ``ycb`` with
-            a ``data.root``, else ``paper``.
-        scene: Changed fields of the preset (:class:`~dopepp.virtual.presets.Preset`).
+        preset: Name or file of the scene preset; None selects ``ycb`` with a ``data.root``, else
+            ``paper``.
+        scene: Changed fields of the preset.
         backgrounds: Folder of photos, or ``skimage`` for the photos of that package; None uses
             procedural images.
         negative_photos: Folder of the user's own images without the parts. Like ``backgrounds``,
@@ -142,8 +142,8 @@ class DataConfig:
 
     Attributes:
         name: Name for folders and tables.
-        format: Format of the labelled images: a key of
-            :data:`~dopepp.experiment.assembly.build_sources.FORMATS`.
+        format: Format of the labelled images: ``ycb_video``, ``bop``, ``ndds``, ``webdataset``, or
+            a format of a user package.
         root: Folder of labelled images; None renders all images.
         objects: Objects of the root to learn; None selects the paper's five objects of YCB-Video,
             else all objects.
@@ -151,7 +151,7 @@ class DataConfig:
         unit: Unit of the mesh files: m, cm, mm or inch; None: m for GLB, as stated in 3MF, else mm.
         symmetries: Symmetries of the objects: None for the data set's symmetries, ``none``,
             ``auto`` (within 1 % of the diameter or a pixel of ``virtual.camera``), a file, or
-            symmetries by object name (:mod:`dopepp.data.part_symmetries`).
+            symmetries by object name.
         real_fraction: Share of labelled images in an epoch.
         synthetic_fraction: Share of YCB-Video's synthetic images among the unlabelled images.
         frames: Frames of YCB-Video for training and test, instead of image sets.

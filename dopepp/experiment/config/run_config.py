@@ -41,10 +41,10 @@ class ModelConfig:
     Attributes:
         name: Name in tables.
         width: Factor on the channel counts of backbone and head.
-        backbone: Node of :data:`~dopepp.models.network.BACKBONES`.
-        attention: Node of :data:`~dopepp.models.network.ATTENTIONS`.
-        head: Node of :data:`~dopepp.models.network.HEADS`.
-        loss: Node of :data:`~dopepp.models.network.LOSSES`.
+        backbone: Node of the backbone.
+        attention: Node of the attention module.
+        head: Node of the head.
+        loss: Node of the loss.
     """
 
     __pydantic_config__ = STRICT
@@ -172,7 +172,7 @@ class FalsePositiveTarget:
 
     Attributes:
         num_empty: Number of frames without objects for choosing the threshold, and of other frames
-            for checking it (:mod:`dopepp.experiment.assembly.negative_frames`).
+            for checking the threshold.
         false_positive_rate: Largest share of these frames that may show a detection; with 1, every
             candidate is reported.
     """
@@ -245,7 +245,7 @@ class MeasurementConfig(FalsePositiveTarget):
         refine: Refinement whose poses are measured, and tuned, besides the network's: ``region`` on
             the image, ``depth`` on the depth image, or a list of both.
         output_dir: Folder of the run folders.
-        extensions: User packages whose code may be used (:mod:`dopepp.core.extensions`).
+        extensions: Names of user packages whose code may be used.
     """
 
     __pydantic_config__ = STRICT
@@ -275,8 +275,8 @@ class RunConfig(MeasurementConfig):
         job: ``train``, ``cost`` or ``lr_finder``.
         cost: Options of ``job=cost``.
         lr_finder: Options of ``job=lr_finder``.
-        table: Table layout of a multirun (:class:`~dopepp.experiment.results.paper.PaperTable`).
-        search: Search of a multirun (:mod:`dopepp.experiment.sweep.optuna_search`).
+        table: Layout of a multirun's table, as in ``conf/experiment/table*.yaml``.
+        search: Options of a search, as in ``conf/search/optuna.yaml``.
         recipe: Name of the combination of loss, optimiser and schedule.
         seed: Seed of the initial weights, and of the content and order of the training images.
         compile: Whether to compile the network with torch.
@@ -287,8 +287,7 @@ class RunConfig(MeasurementConfig):
         resume: Folder of the interrupted run to resume.
         resume_anyway: Whether to resume even if the training data or the loss have changed.
         init_from: Checkpoint with the initial weights. ``auto``: weights learned on random parts if
-            they fit the network (:mod:`dopepp.models.start`). None: the default initialisation of
-            the network.
+            they fit the network. None: the default initialisation of the network.
         model: Network and loss.
         maps: Target maps.
         recovery: Options of the recovery from maps to poses, by the names of
@@ -356,8 +355,7 @@ class EvaluationConfig(MeasurementConfig):
         negatives: Folder of images that show none of the parts.
         negatives_camera: Camera file of these images; None for the camera of the data.
         method: Name of the method of ``results``; None derives the name from the file name.
-        data: Data to measure on: a whole node, or changes to the data of the checkpoint; see
-            :func:`~dopepp.experiment.config.data_config.evaluation_data`.
+        data: Test data: a whole node, or changes to the checkpoint's options.
         virtual: Options of the renders: a whole node, or changes to the checkpoint's options.
         bop_csv: Whether to write the poses of every method as a BOP challenge CSV.
         all_measures: Whether to print the symmetric measures of parts without symmetries.
