@@ -172,7 +172,7 @@ class Lighting(Checked):
         num_panels: Number of distant lamp tubes and windows, which metals mirror.
         panel_intensity: Radiance of a panel.
         panel_width: Standard deviation across a panel, as the sine of an angle.
-        panel_length: Standard deviation along a panel, likewise.
+        panel_length: Standard deviation along a panel, as the sine of an angle.
     """
 
     num_lights: Annotated[tuple[int, int], Span(0, 8, "a count")] = (1, 3)
