@@ -42,7 +42,7 @@ def render(
     num: Annotated[int | None, Option("-n", help="Number of images.")] = None,
     unit: options.Unit = None,
     layout: Annotated[str, Option("--format", help="bop, ndds or webdataset.")] = "bop",
-    preset: Annotated[str, Option(help="Kind of scene.")] = "paper",
+    preset: Annotated[str, Option(help="Scene preset, or a YAML file.")] = "paper",
     size: Annotated[
         str | None,
         Option(
@@ -69,7 +69,7 @@ def render(
         list[str] | None,
         Option("--set", help="Change a field of the preset: lighting.num_lights=[1,3]"),
     ] = None,
-    negatives: Annotated[list[str] | None, Option(help="Parts shown as distractors.")] = None,
+    negatives: Annotated[list[str] | None, Option(help="Unlabelled other parts.")] = None,
 ) -> None:
     """Render labelled images of parts.
 

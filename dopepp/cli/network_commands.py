@@ -26,7 +26,7 @@ def benchmark(
     image: Annotated[Path | None, Option(help="Image (default: renders).")] = None,
     intrinsics: options.Intrinsics = None,
     refine: options.RefineRegion = None,
-    frames: Annotated[int, Option("-n", min=1, max=100_000, help="Frames.")] = 50,
+    frames: Annotated[int, Option("-n", min=1, max=100_000, help="Number of frames.")] = 50,
     unit: options.Unit = None,
     working_distance: options.WorkingDistance = None,
     tilt: options.Tilt = None,

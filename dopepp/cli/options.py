@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
 
 MODEL_HELP: Final = (
-    "Checkpoint (best.ckpt of a run), released network, or mesh file of an untrained part."
+    "Checkpoint (best.ckpt of a run), pretrained/NAME, exported network, or mesh file of a part."
 )
 Model = Annotated[Path, Argument(help=MODEL_HELP)]
 Intrinsics = Annotated[
@@ -40,14 +40,14 @@ RefineRegion = Annotated[
 ]
 Conf = Annotated[
     float | None,
-    Option(help="Minimum score of a pose, 0 to 1 (default: the checkpoint's threshold)."),
+    Option(help="Minimum score of a pose, 0 to 1 (default: the checkpoint's; mesh 0.5)."),
 ]
 MaxMs = Annotated[
     float | None, Option(help="Time limit of the refinement per image, milliseconds.")
 ]
 ScaleError = Annotated[
     float | None,
-    Option(help="Largest relative error of part size or focal length (default: 0.005)."),
+    Option(help="Relative error of part size or focal length (default: 0.005; mesh 0.001)."),
 ]
 Track = Annotated[bool, Option("--track", help="Track the parts from frame to frame.")]
 Meshes = Annotated[
@@ -55,11 +55,11 @@ Meshes = Annotated[
 ]
 Unit = Annotated[str | None, Option(help="Unit of the mesh files: mm, cm, m or inch.")]
 WorkingDistance = Annotated[
-    str | None, Option(help="NEAR,FAR: distances of a part given by its mesh, metres.")
+    str | None, Option(help="NEAR,FAR: distances of a mesh, metres; required for a mesh.")
 ]
 Tilt = Annotated[
     float | None,
-    Option(help="Largest angle between this part's z axis and the camera, degrees (default: 180)."),
+    Option(help="Largest angle from a mesh's +z axis to the camera, degrees (default: 180)."),
 ]
 Device = Annotated[str, Option(help="PyTorch device, e.g. cpu or cuda.")]
 

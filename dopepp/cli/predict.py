@@ -42,7 +42,7 @@ def predict(
     camera: options.CameraFile = None,
     K_size: options.KSize = None,
     crop: options.Crop = None,
-    topic: Annotated[str | None, Option(help="Image topic of a ROS bag with several.")] = None,
+    topic: Annotated[str | None, Option(help="Image topic, if a ROS bag has several.")] = None,
     distance: options.Distances = None,
     roi: Annotated[
         tuple[int, int, int, int] | None, Option(help="Region of interest: x y width height.")
