@@ -32,7 +32,7 @@ class RenderCommand(TyperCommand):
         from dopepp.virtual.presets import PRESETS
 
         (preset,) = (parameter for parameter in self.params if parameter.name == "preset")
-        preset.help = f"Kind of scene: {', '.join(PRESETS)}."  # type: ignore[attr-defined]
+        preset.help = f"Scene preset ({', '.join(PRESETS)}), or a YAML file."  # type: ignore[attr-defined]
         super().format_help(ctx, formatter)
 
 
