@@ -142,7 +142,7 @@ def _facts(task: GraspTask, records: Sequence[Record], seconds: float) -> dict[s
         "part": task.part,
         "network": task.network and f"{task.network}, {'' if task.refine else 'not '}refined",
         "layout": task.layout,
-        "pictures": task.renderer,
+        "renderer": task.renderer,
         "second view, first trial": next(reasons, None),
         "seed": task.seed,
         "hand-eye, worst": f"{worst_mm:.2f} mm, {worst_deg:.3f}°",
