@@ -29,7 +29,7 @@ SIZE: Final = (480, 360)  # of a photo, pixels
 PART_PX: Final = 120.0  # diameter of the part at the geometric mean of its distances, pixels
 MARGIN: Final = 2.5  # distance of the level from the photos' mean, standard deviations
 LOWEST: Final = 0.0  # lower bound of the level, log odds
-VERSION: Final = 12  # part of the cache's key; increase it when search or verification change
+VERSION: Final = 13  # part of the cache's key; increase it when search or verification change
 
 Measure = Callable[[Iterable[RGBImage], CameraMatrix], list[float]]
 """Function that returns the largest log odds of the verified poses on each image."""
