@@ -25,7 +25,8 @@ from sklearn.metrics import brier_score_loss
 
 from dopepp.geometry.camera import Transform
 from dopepp.inference.template_estimator import TemplateEstimator
-from dopepp.inference.templates import TemplateDetector, ranking
+from dopepp.inference.templates import ranking
+from dopepp.inference.templates.detector import TemplateDetector
 from dopepp.parts.symmetry_finder import find_symmetries
 from dopepp.recovery.detection import refined_features
 from dopepp.virtual.backgrounds import find_backgrounds

@@ -24,7 +24,7 @@ from dopepp.geometry.camera import project, transform
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.template_estimator import TemplateEstimator, load_solid_part
-from dopepp.inference.templates import TemplateDetector
+from dopepp.inference.templates.detector import TemplateDetector
 from dopepp.metrics.functional import BOP_MSPD_THRESHOLDS
 
 PASSING = (0.1, 0.05)  # ADD, diameters

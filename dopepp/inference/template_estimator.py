@@ -28,8 +28,8 @@ from dopepp.inference.input_image import METRES, Depth, Distances, Region, check
 from dopepp.inference.network_input import are_same, merge_scales
 from dopepp.inference.refinement.refiner import Refine, refine_terms
 from dopepp.inference.refinement.verification import MIN_DIFFERENCE, Verifier
-from dopepp.inference.templates import TemplateDetector, distinct_poses
 from dopepp.inference.templates.background_level import background_log_odds
+from dopepp.inference.templates.detector import TemplateDetector, distinct_poses
 from dopepp.inference.templates.ranking import learned_ranking
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part, check_name

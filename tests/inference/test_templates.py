@@ -13,14 +13,14 @@ from dopepp.geometry.camera import camera_matrix, project, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.outline import make_outline_mesh
 from dopepp.inference.template_estimator import TemplateEstimator
-from dopepp.inference.templates import (
+from dopepp.inference.templates import views
+from dopepp.inference.templates.detector import (
     SAME_DEPTH,
     SAME_PLACE,
     SAME_TURN,
     SMALLEST_PX,
     TemplateDetector,
     distinct_poses,
-    views,
 )
 from dopepp.inference.templates.matching import (
     CELL,

@@ -11,7 +11,7 @@ from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import make_outline_mesh, posed
 from dopepp.inference.template_estimator import TemplateEstimator
-from dopepp.inference.templates import TemplateDetector
+from dopepp.inference.templates.detector import TemplateDetector
 from dopepp.inference.templates.turns import nearly_round_turns
 from dopepp.parts.part import Mesh, make_part
 from dopepp.parts.symmetry_finder import axis_rotation
