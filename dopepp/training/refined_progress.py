@@ -114,7 +114,7 @@ class RefinedProgress(Callback):
         """Add images ``first`` to ``end`` − 1; return recall, number of instances and precision."""
         for index in range(first, min(end, len(self.images))):
             sample = self.images.sample(index)
-            poses = estimator.predict(sample.image, sample.K)
+            poses = estimator.predict(sample.image, sample.K, cropped=True)
             metrics.update(poses, sample.instances, sample.K, sample.image.shape[1])
         rows = metrics.compute()
         mean = rows.pop(MEAN)

@@ -10,6 +10,7 @@ import torch
 from dopepp.core.files import read_csv
 from dopepp.data.rendered import RenderedSource
 from dopepp.drawing.pictures import read_rgb
+from dopepp.geometry.camera import crop_camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import PoseMetrics
@@ -26,7 +27,7 @@ class TruePoses:
     def __init__(self, images, wrong):
         self.images, self.wrong, self.count = images, wrong, 0
 
-    def predict(self, image, K):
+    def predict(self, image, K, cropped):
         (instance,) = self.images.sample(self.count).instances
         T = instance.T_cam_obj.copy()
         T[0, 3] += 0.05 * self.wrong(self.count)
@@ -133,6 +134,14 @@ def test_the_estimator_has_the_networks_present_weights(make_system, images):
     torch.testing.assert_close(list(estimator.maps(image)), expected, atol=1e-4, rtol=1e-7)
 
 
+def test_images_may_be_crops(make_system, images):
+    sample, system = images.sample(0), make_system()
+    off_centre = replace(sample, K=crop_camera(sample.K, 0.3 * sample.image.shape[1], 0))
+    progress = RefinedProgress(Repeated([off_centre]), "region")
+    measured = progress._measure(progress._estimator(system), PoseMetrics(system.parts), 0, 1)
+    assert measured[1] == 1
+
+
 def test_all_instances_have_equal_weights(part, images):
     other = replace(part, name="other")
     (instance,) = images.sample(0).instances
@@ -141,7 +150,7 @@ def test_all_instances_have_equal_weights(part, images):
         [replace(images.sample(0), instances=both if k == 0 else both[:1]) for k in range(10)]
     )
     estimator = SimpleNamespace(
-        predict=lambda image, K: TruePoses(images, lambda n: False).predict(image, K)
+        predict=TruePoses(Repeated([images.sample(0)] * 10), lambda n: False).predict
     )
     progress = RefinedProgress(samples, "region")
     share, count, _ = progress._measure(estimator, PoseMetrics([part, other]), 0, 10)
