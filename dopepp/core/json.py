@@ -36,8 +36,8 @@ _STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL
 """A string literal, possibly cut off at the end of the text."""
 
 _EXPONENT: Final = re.compile(rb"[eE]\+?0*[1-9]\d\d")
-_LONG_DIGITS: Final = 300
-"""A number beyond float64's range has three digits of exponent, or this many digits."""
+_LONG_DIGITS: Final = 200
+"""A number beyond float64's range (1.8e308) has three digits of exponent, or over 200 digits."""
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:

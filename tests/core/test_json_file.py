@@ -30,6 +30,7 @@ def test_parses_like_the_json_module(value, ascii_only, indent):
     ('["NaN Infinity", -Infinity]', "'-Infinity', not"),
     ("[1.0, 1e308, 1e999]", "'1e999', not"),
     ("[" + "9" * 400 + ".5]", "999, not"),
+    ("[" + "9" * 250 + "e99]", "999, not"),
     ("[-1E+400]", "'-1E+400', not"),
     ('{"12": 1, "2": {"x": 1, "12": 2, "x": 3}}', "key 'x' twice"),
     ('{"a": 1, "a": 1}', "key 'a' twice"),
