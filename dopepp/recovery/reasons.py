@@ -64,7 +64,8 @@ def no_centroid(
     highest, centroid = float(best.max()), float(best[CENTROID])
     if highest <= options.peak_threshold:
         return Reason(name, "empty", highest, f"its maps are empty, no belief above {highest:.2g}")
-    text = f"best belief of a centroid {centroid:.2g} below {options.centroid_threshold:g}"
+    threshold = max(options.centroid_threshold, options.peak_threshold)
+    text = f"best belief of a centroid {centroid:.2g} below {threshold:g}"
     return Reason(name, "centroid", centroid, text)
 
 

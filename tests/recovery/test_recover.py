@@ -183,6 +183,9 @@ def test_few_corners_and_small_parts_are_reasons(make_scene, box, pose):
     assert scene.recover(belief, field) == []
     (few,) = explain(belief, field, scene.cuboids, scene.K)
     assert "only 3 usable points, 4 are needed" in few.text
+    belief[8] *= 0.5
+    (low,) = explain(belief, field, scene.cuboids, scene.K, peak_threshold=0.6)
+    assert low.text.endswith("below 0.6")  # the higher of both thresholds
     scene = make_scene(box).place(0, make_transform(np.eye(3), np.array([0.0, 0.0, 15.0])))
     (small,) = explain(*scene.maps(), scene.cuboids, scene.K, min_score=1.0)
     assert small.kind == "small"
