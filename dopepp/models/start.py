@@ -36,12 +36,13 @@ def start_from_parts(network: PoseNetwork) -> bool:
 def start_from_checkpoint(network: PoseNetwork, path: Path) -> None:
     """Copy the weights of a checkpoint to a network of the same architecture.
 
-    The output layers keep their initial weights if the numbers of objects differ.
+    The output layers keep their initial weights if the number of objects or the activation differs.
     """
     checkpoint = read(path)
     weights = checkpoint.state_dict
     others: set[str] = set()
-    if len(checkpoint.parts) != network.num_objects:
+    learned = len(checkpoint.parts), checkpoint.spec["activation"]
+    if learned != (network.num_objects, network.activation):
         others = output_tensors(network)
         weights = {name: value for name, value in weights.items() if name not in others}
     if not _copy(network, weights, others):

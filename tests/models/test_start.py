@@ -62,11 +62,14 @@ def test_a_checkpoint_of_another_architecture_is_refused(small_spec, write):
         start_from_checkpoint(build_network(other), path)
 
 
-@pytest.mark.parametrize(("num_objects", "kept"), [(1, set()), (2, OUTPUTS)])
-def test_a_checkpoint_of_other_objects_leaves_the_output_layers(
-    small_fast_spec, write, num_objects, kept
+@pytest.mark.parametrize(
+    ("changed", "kept"),
+    [({}, set()), ({"num_objects": 2}, OUTPUTS), ({"activation": "identity"}, OUTPUTS)],
+)
+def test_a_checkpoint_of_other_objects_or_another_loss_leaves_the_output_layers(
+    small_fast_spec, write, changed, kept
 ):
-    weights, path = write({**small_fast_spec, "num_objects": num_objects})
+    weights, path = write({**small_fast_spec, **changed})
     network = build_network(small_fast_spec)
     before = weights_of(network)
     start_from_checkpoint(network, path)
