@@ -194,7 +194,7 @@ def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
     """
     try:
         matrix = np.array(K, np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         matrix = np.empty(0)
     # Calibration files have few digits, so zeros and ones are compared with a tolerance.
     fixed = np.array([[np.nan, 0, np.nan], [0, np.nan, np.nan], [0, 0, 1]])

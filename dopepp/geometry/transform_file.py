@@ -86,11 +86,11 @@ def parse_transform(value: object, where: str, tolerance: float = ROUNDED) -> Tr
                 position = fields["position"]
                 x_first = fields.get("quaternion_xyzw")
                 quaternion = (
-                    fields["quaternion_wxyz"] if x_first is None else [x_first[3], *x_first[:3]]
+                    fields["quaternion_wxyz"] if x_first is None else [*x_first[3:], *x_first[:3]]
                 )
             R = quaternion_to_matrix(np.array(quaternion, np.float64).reshape(4))
             T = make_transform(R, np.array(position, np.float64).reshape(3))
-    except (KeyError, IndexError, TypeError, ValueError):
+    except (LookupError, OverflowError, TypeError, ValueError):
         raise UserError(problem, _FORMS, _FIX) from None
     if not is_rigid(T, tolerance):
         raise UserError(problem, "a rigid transform", _FIX)

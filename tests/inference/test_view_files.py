@@ -37,6 +37,7 @@ def test_every_form_of_a_pose_is_read(form):
     [None, {}, [1, 2], {"matrix": (2 * T_WORLD_CAM).tolist()}, {"matrix": np.eye(3).tolist()},
      {"position": [0, 0], "quaternion_wxyz": [1, 0, 0, 0]}, {"position": [0, 0, float("nan")],
      "quaternion_wxyz": [1, 0, 0, 0]}, {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]},
+     {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1, 0]}, {"matrix": [[10**400] * 4] * 4},
      {"translation": {"x": 0, "y": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}],
 )  # fmt: skip
 def test_other_forms_are_rejected(form):
