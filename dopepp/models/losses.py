@@ -29,7 +29,10 @@ class MapLoss(nn.Module, ABC):
     def parts(
         self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
-        """Return the weighted terms of one stage per image; the loss is the mean of their sums."""
+        """Return the weighted terms of one stage per image; the loss is the mean of their sums.
+
+        The method is also called under ``torch.vmap``, so it must not branch on values.
+        """
 
     def forward(
         self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
@@ -38,7 +41,14 @@ class MapLoss(nn.Module, ABC):
 
         Loss and terms are float32 also under autocast: sums of exponentials need the precision.
         """
-        summed = self._summed(stages, belief_target, field_target)
+        summed: dict[str, Tensor] = {}
+        with torch.autocast(belief_target.device.type, enabled=False):
+            for logits, field in stages:
+                parts = self.parts(
+                    logits.float(), field.float(), belief_target.float(), field_target.float()
+                )
+                for name, value in parts.items():
+                    summed[name] = summed[name] + value if name in summed else value
         terms = {name: value.mean() for name, value in summed.items()}
         total = torch.stack(list(terms.values())).sum()
         return total, {name: value.detach() for name, value in terms.items()}
@@ -47,23 +57,13 @@ class MapLoss(nn.Module, ABC):
     def per_image(
         self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
     ) -> Float[Tensor, "batch"]:
-        """Return the loss of each image, to choose among equally valid targets."""
-        terms = self._summed(stages, belief_target, field_target)
-        return torch.stack(list(terms.values())).sum(dim=0)
+        """Return the loss of each image alone, to choose among equally valid targets."""
 
-    def _summed(
-        self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
-    ) -> dict[str, Float[Tensor, "batch"]]:
-        """Return the terms of each image, summed over the stages."""
-        terms: dict[str, Tensor] = {}
-        with torch.autocast(belief_target.device.type, enabled=False):
-            for logits, field in stages:
-                parts = self.parts(
-                    logits.float(), field.float(), belief_target.float(), field_target.float()
-                )
-                for name, value in parts.items():
-                    terms[name] = terms[name] + value if name in terms else value
-        return terms
+        def alone(stages: Sequence[Stage], *targets: Tensor) -> Tensor:
+            pairs = [(logits[None], field[None]) for logits, field in stages]
+            return self.forward(pairs, *(target[None] for target in targets))[0]  # without hooks
+
+        return torch.vmap(alone)(list(stages), belief_target, field_target)  # type: ignore[no-any-return]
 
 
 class MapMSE(MapLoss):

@@ -81,24 +81,21 @@ def choose_keypoints(
     ``stages`` is chosen; without stages, the pose nearest to the reference orientation.
     """
     choices, allowed = symmetry.equivalents(batch)
-    keypoints = choices[:, :, 0].clone()
     if stages is None:
-        return keypoints
+        return choices[:, :, 0]
     is_open = allowed[:, :, 1:].any(dim=-1) & (batch.visible_fraction >= MIN_VISIBLE_FRACTION)
-    index = is_open.nonzero()
+    losses = torch.full(allowed.shape, torch.inf, device=allowed.device)
+    index = (allowed & is_open[..., None]).nonzero()
     # As many maps as the batch has images at a time, for bounded memory.
-    for rows, slots in (part.unbind(-1) for part in torch.split(index, len(batch))):
+    for start in range(0, len(index), len(batch)):
+        rows, slots, numbers = index[start : start + len(batch)].unbind(-1)
         outputs = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
         height, width = outputs[0][0].shape[-2:]
-        objects = batch.object_index[rows, slots, None]
-        losses = []
-        for choice in choices[rows, slots].unbind(1):
-            given = choice[:, None], objects, symmetry.num_objects, (height, width), geometry
-            maps = encode(*given)
-            losses.append(loss.per_image(outputs, *maps))
-        best = torch.stack(losses, -1).where(allowed[rows, slots], torch.inf).argmin(-1)
-        keypoints[rows, slots] = choices[rows, slots, best]
-    return keypoints
+        keypoints, objects = choices[rows, slots, numbers, None], batch.object_index[rows, slots]
+        maps = encode(keypoints, objects[:, None], symmetry.num_objects, (height, width), geometry)
+        losses[rows, slots, numbers] = loss.per_image(outputs, *maps)
+    best = losses.argmin(-1)[..., None, None, None].expand(*choices.shape[:2], 1, 9, 2)
+    return choices.gather(2, best)[:, :, 0]
 
 
 class Equivalents(NamedTuple):

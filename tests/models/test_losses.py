@@ -134,12 +134,18 @@ def test_terms_are_float32_under_autocast_and_stages_add_up(loss):
 
 
 @pytest.mark.parametrize("loss", [MapMSE(), SpatialCrossEntropy(1.0, field_weight=0.2)])
-def test_losses_of_the_images_have_the_loss_as_their_mean(loss):
+def test_the_loss_of_an_image_does_not_depend_on_the_other_images(loss):
     generator = torch.Generator().manual_seed(3)
     belief, field = torch.rand(4, 9, 8, 8, generator=generator), torch.zeros(4, 16, 8, 8)
     field[:, :, 2:5, 2:5] = 0.7
+    field[1, 4:], field[2] = 0, 0  # fewer discs, no disc
     stages = [(torch.randn(4, 9, 8, 8, generator=generator), 0.1 * field) for _ in range(2)]
     stages[0][0].requires_grad_()
-    images = loss.per_image(stages, belief, field)
+    calls = []
+    with loss.register_forward_hook(lambda *_: calls.append(1)):  # as job=lr_finder does
+        images = loss.per_image(stages, belief, field)
+    assert not calls
     assert (images.shape, images.requires_grad) == ((4,), False)
-    assert images.mean().item() == pytest.approx(loss(stages, belief, field)[0].item(), rel=1e-5)
+    for k, alone in enumerate(images):
+        maps = [tuple(item[k : k + 1] for item in pair) for pair in (*stages, (belief, field))]
+        assert alone.item() == pytest.approx(loss(maps[:2], *maps[2])[0].item(), rel=1e-5)

@@ -56,6 +56,6 @@ def test_a_sweep_ends_at_a_non_finite_loss(tiny, tmp_path, monkeypatch):
 
 def test_a_loss_that_diverges_at_once_has_no_table(tiny, tmp_path, monkeypatch):
     broken = {"none": torch.full((4,), np.nan, requires_grad=True)}
-    monkeypatch.setattr(SpatialCrossEntropy, "_summed", lambda *_: broken)
+    monkeypatch.setattr(SpatialCrossEntropy, "parts", lambda *_: broken)
     with pytest.raises(RunError, match=r"diverged after 0 steps .* smaller lr_finder\.min_lr"):
         find_learning_rate(tiny(), tmp_path)
