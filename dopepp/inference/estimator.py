@@ -205,15 +205,18 @@ class PoseEstimator(ABC):
 
     @abstractmethod
     def start_detections(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self,
+        image: RGBImage,
+        K: CameraMatrix,
+        distances: Distances | None,
+        roi: Region | None,
+        reasons: list[Reason] | None = None,
     ) -> tuple[list[Detection], list[SeenMaps]]:
-        """Return detections before refinement, best score first, and the maps that show them."""
+        """Return detections before refinement, best score first, and the maps that show them.
 
-    @abstractmethod
-    def _missing(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> list[Reason]:
-        """Return a reason for each part without a candidate, and each rejected start detection."""
+        A reason is appended to ``reasons`` for each part without a candidate, and for each rejected
+        candidate. Then, without refinement, scores below :attr:`min_score` are rejected, too.
+        """
 
     def __repr__(self) -> str:
         """Describe the detector, the parts with their depths, and the thresholds."""
@@ -468,10 +471,9 @@ class PoseEstimator(ABC):
             A reason for each part without a candidate, and for each rejected candidate.
         """
         image, K, depth = prepare_image(image, K, None, depth, cropped)
-        reasons = self._missing(image, K, distances, roi)
-        if self.refiner is None:
-            return reasons
-        candidates = self.candidates(image, K, None, depth, distances, roi, cropped)
+        reasons: list[Reason] = []
+        starts, _ = self.start_detections(image, K, distances, roi, reasons)
+        candidates = self.candidates_from(starts, image, K, depth)
         rejected = [candidate for candidate in candidates if candidate.score < self.min_score]
         return reasons + [refined_reason(candidate, self.min_score) for candidate in rejected]
 

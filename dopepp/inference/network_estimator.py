@@ -20,7 +20,7 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import CANDIDATE, PROBABLE, Detection, RecoveryOptions
 from dopepp.recovery.reasons import Reason, format_reasons
-from dopepp.recovery.recover import explain, recover
+from dopepp.recovery.recover import recover_batch
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
@@ -88,12 +88,20 @@ class NetworkEstimator(PoseEstimator):
         return f"{name} as {runtime}, {width}×{height} pixels"
 
     def start_detections(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self,
+        image: RGBImage,
+        K: CameraMatrix,
+        distances: Distances | None,
+        roi: Region | None,
+        reasons: list[Reason] | None = None,
     ) -> tuple[list[Detection], list[SeenMaps]]:
         """Return detections before refinement, best score first, and the maps that show them."""
         with self.timed("pre"):
             views = self.views(image, K, distances, roi)
-        stride, options = self.network.stride, self._recovery_options(0.0)
+        # With refinement, the threshold is lower.
+        threshold = 0.0 if reasons is None else self.min_score
+        threshold = threshold if self.refiner is None else CANDIDATE
+        stride, options = self.network.stride, vars(replace(self.recovery, min_score=threshold))
         scales, seen = list[list[Detection]](), list[SeenMaps]()
         for view in views:
             # A second view hardly improves a probable detection, and doubles the time.
@@ -105,9 +113,9 @@ class NetworkEstimator(PoseEstimator):
                 belief, field = self.maps(pixels)
             with self.timed("decode"):
                 depths = self._searched_depths(view)
-                detections = recover(
-                    belief, field, self.cuboids, view.K, stride, self._names,
-                    depths, **options,
+                (detections,) = recover_batch(
+                    belief[None], field[None], self.cuboids, view.K[None], stride, self._names,
+                    reasons, depths, **options,
                 )  # fmt: skip
             scales.append(
                 [view.to_image(item, self._cuboid_of[item.object], K) for item in detections]
@@ -134,17 +142,6 @@ class NetworkEstimator(PoseEstimator):
             for part in self.parts
         ]
 
-    def _missing(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> list[Reason]:
-        """Return a reason for each part without a candidate, and each rejected start detection."""
-        stride, options = self.network.stride, self._recovery_options(self.min_score)
-        reasons: list[Reason] = []
-        for view in self.views(image, K, distances, roi):
-            belief, field = self.maps(view.pixels)
-            reasons += explain(belief, field, self.cuboids, view.K, stride, self._names, **options)
-        return reasons
-
     def views(
         self,
         image: RGBImage,
@@ -162,11 +159,6 @@ class NetworkEstimator(PoseEstimator):
         with torch.inference_mode():
             belief, field = self.network.maps(pixels)
         return belief[0].float(), field[0].float()
-
-    def _recovery_options(self, min_score: float) -> dict[str, float]:
-        """Return the options of the recovery; with refinement, the threshold is `CANDIDATE`."""
-        threshold = min_score if self.refiner is None else CANDIDATE
-        return vars(replace(self.recovery, min_score=threshold))
 
 
 def search_again(

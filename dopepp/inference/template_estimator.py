@@ -147,7 +147,12 @@ class TemplateEstimator(PoseEstimator):
         return "templates of meshes"
 
     def start_detections(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
+        self,
+        image: RGBImage,
+        K: CameraMatrix,
+        distances: Distances | None,
+        roi: Region | None,
+        reasons: list[Reason] | None = None,
     ) -> tuple[list[Detection], list[SeenMaps]]:
         """Return start poses of all parts, best score first, and no maps."""
         with self.timed("decode"):
@@ -157,7 +162,12 @@ class TemplateEstimator(PoseEstimator):
                 for detector in self.detectors
                 for start in detector.detect(image, K, depths, roi)
             ]
-            return sorted(starts, key=lambda detection: -detection.score), []
+        if reasons is not None:
+            text = f"no view of the part fits the image at {depths[0]:.2g} – {depths[1]:.2g} m"
+            detected = {start.object for start in starts}
+            names = [part.name for part in self.parts if part.name not in detected]
+            reasons += [Reason(name, "empty", 0.0, text) for name in names]
+        return sorted(starts, key=lambda detection: -detection.score), []
 
     def refined(
         self,
@@ -302,17 +312,6 @@ class TemplateEstimator(PoseEstimator):
             options = replace(self.recovery, refined_bias=bias)
             scored += recalibrate([detection], options, by_depth)
         return merge_scales([[detection] for detection in scored])
-
-    def _missing(
-        self, image: RGBImage, K: CameraMatrix, distances: Distances | None, roi: Region | None
-    ) -> list[Reason]:
-        """Return a reason for each part without a start detection."""
-        near, far = self._range(distances)
-        text = f"no view of the part fits the image at {near:.2g} – {far:.2g} m"
-        starts, _ = self.start_detections(image, K, distances, roi)
-        detected = {start.object for start in starts}
-        names = [part.name for part in self.parts if part.name not in detected]
-        return [Reason(name, "empty", 0.0, text) for name in names]
 
     def _range(self, distances: Distances | None) -> tuple[float, float]:
         """Return the depths to search: ``distances`` or, by default, the working distance."""

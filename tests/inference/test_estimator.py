@@ -360,8 +360,11 @@ def test_refined_poses_have_a_separate_threshold(parts_path):
     unrefined.recovery = estimator.recovery
     assert unrefined.min_score == 0.2
     (candidate,) = estimator.candidates(rendered.image, K_VGA)
-    least = float(np.nextafter(candidate.score, 1))
+    least, runs, maps = float(np.nextafter(candidate.score, 1)), [], estimator.maps
+    estimator.maps = lambda pixels: runs.append(pixels) or maps(pixels)
     assert estimator.reporting(least).predict(rendered.image, K_VGA) == []
+    runs.clear()
     reason = estimator.reporting(least).explain(rendered.image, K_VGA)[-1]
     assert (reason.kind, reason.best) == ("refined", candidate.score)
+    assert len(runs) == len(estimator.views(rendered.image, K_VGA))  # one run for each size
     assert estimator.reporting(0.3).refining("region").min_score == 0.3
