@@ -7,6 +7,7 @@ entry to ``conf/callbacks``.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -159,15 +160,14 @@ class PoseSystem(LightningModule):
         self._apply_settings()
         configs = self.trainer.lr_scheduler_configs
         present = [_without_progress(config.scheduler.state_dict()) for config in configs]
-        if present == self._resumed_schedules:
+        if self._resumed_schedules in (None, present):
             return  # the optimiser's rates already equal the rates of this schedule
         for config in configs:
-            # A schedule that multiplies the last rate would stay at 0 after a shorter schedule.
-            closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
-            if closed_form is not None:
-                groups = config.scheduler.optimizer.param_groups
-                for group, rate in zip(groups, closed_form(), strict=True):
-                    group["lr"] = rate
+            with warnings.catch_warnings():
+                # torch advises against a given step, but only a given step sets the rate in closed
+                # form. A schedule that multiplies the last rate would stay at 0.
+                warnings.simplefilter("ignore")
+                config.scheduler.step(self.global_step)
 
     def _apply_settings(self) -> None:
         """Replace the optimiser settings of the checkpoint, except those that a schedule sets."""
