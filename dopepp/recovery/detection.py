@@ -70,7 +70,8 @@ class Detection:
         keypoints: The cuboid's corners and centroid projected with this pose, pixels.
         peaks: Measured keypoints, pixels; NaN for keypoints that are missing or do not agree with
             the pose.
-        reprojection_error_px: RMS distance between ``keypoints`` and ``peaks``, pixels.
+        reprojection_error_px: RMS distance between ``peaks`` and the keypoints at the pose before
+            ``distance_factor`` and before refinement, pixels.
         covariance: Covariance of a small rotation about the object's origin (rotation vector in
             the camera frame, radians) and a small translation (camera frame, metres).
         kept: Why the refinement kept the network's pose; empty otherwise.
