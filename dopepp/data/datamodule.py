@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -123,7 +124,12 @@ class PoseDataModule(LightningDataModule):
 
     def val_dataloader(self) -> PoseLoader:
         """Return the loader of batches in order; all ranks together yield each item once."""
-        return self._loader(self.val_item, self.val_source, shuffle=False)
+        loader = self._loader(self.val_item, self.val_source, shuffle=False)
+        if not loader.num_common_batches:
+            problem = f"{len(self.val_source)} validation images for more processes"
+            fix = "raise data.num_val, or lower trainer.devices"
+            raise UserError(problem, "at least one validation image per process", fix)
+        return loader
 
     def _loader(self, item: Item, source: DescribedSource, shuffle: bool) -> PoseLoader:
         dataset, trainer = SampleDataset(item, len(source)), self.trainer
@@ -219,11 +225,12 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
     ) -> None:
         super().__init__(dataset, num_replicas=world_size, rank=rank, shuffle=shuffle, seed=seed)
         self._num_items, self._rank, self._world_size = len(dataset), rank, world_size
+        self.num_common_items = self._num_items // world_size  # items that every rank has
         self.skip = 0
 
     def __len__(self) -> int:
         if self.shuffle:
-            return self._num_items // self._world_size
+            return self.num_common_items
         return len(range(self._rank, self._num_items, self._world_size))
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
@@ -282,6 +289,12 @@ class PoseLoader(DataLoader[Any]):
         # reference cycle, and the collector closes their queues before they have ended.
         self._iterator = None
         raise batch
+
+    @property
+    def num_common_batches(self) -> int:
+        """Number of batches that every rank has; without shuffling, ranks may have one more."""
+        assert self.batch_size is not None
+        return math.ceil(self._epoch_sampler.num_common_items / self.batch_size)
 
     def state_dict(self) -> dict[str, int]:
         """Return the number of yielded batches of this pass, which Lightning stores."""

@@ -112,10 +112,13 @@ class LastCheckpoint(Checkpoint):
         self._random = _capture()
 
     def on_validation_batch_start(
-        self, trainer: Trainer, pl_module: LightningModule, *_: Any
+        self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int, *_: Any
     ) -> None:
         """Save like :meth:`on_train_batch_start`; a resumed run repeats the whole validation."""
-        self._save_if_due(trainer, _before_validation)
+        loader = trainer.val_dataloaders
+        # Processes decide together, but some have a batch more than others.
+        if not isinstance(loader, PoseLoader) or batch_idx < loader.num_common_batches:
+            self._save_if_due(trainer, _before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Discard the random states of the start of the validation."""

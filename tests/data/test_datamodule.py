@@ -115,6 +115,17 @@ def test_ranks_share_the_items(fake_source, shuffle, num_items):
         assert sorted(index for _, index in union) == list(range(num_items))
 
 
+@pytest.mark.parametrize(("batch_size", "common"), [(1, 2), (2, 1), (3, 1)])
+def test_ranks_know_how_many_validation_batches_all_have(build, batch_size, common):
+    datamodule, lengths = build(batch_size=batch_size), []
+    for rank in range(2):
+        datamodule.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        loader = datamodule.val_dataloader()
+        lengths.append(len(loader))
+        assert loader.num_common_batches == common
+    assert min(lengths) == common
+
+
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_user_error_of_a_worker_is_raised_as_one_line(build, fake_source, num_workers):
     error = UserError("frame 7", "complete frames", "download it again")
@@ -182,6 +193,9 @@ def test_wrong_options(build):
     divided.trainer = SimpleNamespace(global_rank=0, world_size=2)
     with pytest.raises(UserError, match="12 training images for processes with batches of 8"):
         divided.train_dataloader()
+    divided.trainer.world_size = 6
+    with pytest.raises(UserError, match="5 validation images for more processes"):
+        divided.val_dataloader()
     with pytest.raises(ValueError, match="masking requires backgrounds"):
         build(backgrounds=None)
     assert build(masking=None, augment=None, backgrounds=None).train_item(0, 0).size == (64, 64)

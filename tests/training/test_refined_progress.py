@@ -160,10 +160,12 @@ def test_all_instances_have_equal_weights(part, images):
 @pytest.mark.slow
 @pytest.mark.ddp
 def test_two_processes_stop_together(command, tmp_path):
+    """The processes have two and one validation batches."""
     done = command(
         "train.py", "experiment=quickstart", "trainer=ddp", "trainer.accelerator=cpu", "stop_at=0",
-        "data.samples_per_epoch=128", "data.num_val=4", "data.num_test=2", "data.num_workers=0",
-        "tune=false", f"hydra.run.dir={tmp_path / 'run'}", timeout=240, code=0,
+        "data.samples_per_epoch=16", "data.batch_size=2", "data.num_val=5", "data.num_test=2",
+        "data.num_workers=0", "tune=false", f"hydra.run.dir={tmp_path / 'run'}",
+        timeout=240, code=0,
     )  # fmt: skip
     assert done.out.count("stop_at=0 is reached") == 1
     epochs = {row["epoch"] for row in read_csv(tmp_path / "run" / "metrics.csv")}
