@@ -65,6 +65,7 @@ def test_the_suffix_determines_the_format_of_an_image(name, head, tmp_path):
         ("a.gif", r"suffixes \.png, \.jpg, \.jpeg"),
         ("a", "to write; allowed"),
         (".", "which is a folder; allowed"),
+        ("/", "pass e.g. file.png"),
         ("folder.png", "Is a directory"),
         ("file/a.png", "File exists|Not a directory"),
         ("/proc/none/a.png", "No such file"),
