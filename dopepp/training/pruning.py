@@ -71,16 +71,24 @@ class TrialReport(Callback):
         value = trainer.callback_metrics.get(self.monitor)
         if value is None or not math.isfinite(value):
             return
+        if trainer.is_global_zero:
+            self.pruned = self._report(trainer, float(value))
+        # Another trial may report between the decisions of two processes.
+        self.pruned = trainer.strategy.broadcast(self.pruned)
+        trainer.should_stop = trainer.should_stop or bool(self.pruned)
+
+    def _report(self, trainer: Trainer, value: float) -> str:
+        """Report a value of the epoch; return why the trial stops, or an empty text."""
         epoch = trainer.current_epoch
-        self._storage.set_trial_intermediate_value(self._trial_id, epoch, float(value))
+        self._storage.set_trial_intermediate_value(self._trial_id, epoch, value)
         last = trainer.max_epochs is not None and epoch + 1 >= trainer.max_epochs
         trial = self._storage.get_trial(self._trial_id)
-        if self.prune and not last and self._study.pruner.prune(self._study, trial):
-            self.pruned = (
-                f"after epoch {epoch}, whose {self.monitor} of {float(value):.4g} is worse "
-                "than the other trials' median"
-            )
-            trainer.should_stop = True
+        if not self.prune or last or not self._study.pruner.prune(self._study, trial):
+            return ""
+        return (
+            f"after epoch {epoch}, whose {self.monitor} of {value:.4g} is worse "
+            "than the other trials' median"
+        )
 
 
 def raise_if_pruned(trainer: Trainer) -> None:

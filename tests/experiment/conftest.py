@@ -104,6 +104,8 @@ def train(config, run_dir):
     if "trial" in config["callbacks"]:
         report = CALLBACKS.build(config["callbacks"]["trial"])
         trainer = SimpleNamespace(max_epochs=EPOCHS, should_stop=False, callbacks=[report])
+        trainer.is_global_zero = True
+        trainer.strategy = SimpleNamespace(broadcast=lambda decision: decision)
         report.setup(trainer, None, "fit")
         for trainer.current_epoch in range(EPOCHS):
             now = torch.tensor(value * (trainer.current_epoch + 1) / EPOCHS)

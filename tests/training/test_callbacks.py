@@ -7,6 +7,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import torch
 from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import TQDMProgressBar
 
@@ -20,6 +21,7 @@ from dopepp.training.pose_validation import (
     Overlays,
     PoseMetricsCallback,
 )
+from dopepp.training.pruning import PrunedError, TrialReport, open_storage, raise_if_pruned
 from dopepp.training.system import PoseSystem, ValidationOutput
 from dopepp.training.throughput import Throughput, make_profiler, profile_rows
 
@@ -192,3 +194,21 @@ def test_validation_within_an_epoch_is_not_waiting_for_the_loader(monkeypatch):
     callback.on_train_batch_end(trainer, module, None, [0] * 4)
     callback.on_train_epoch_end(trainer, module)
     assert logged == {"throughput/images_per_s": 2.0, "throughput/loader_wait": 0.5}
+
+
+def test_all_processes_of_a_trial_take_the_decision_of_the_first(tmp_path):
+    optuna, storage = pytest.importorskip("optuna"), str(tmp_path / "study.db")
+    study = optuna.create_study(storage=open_storage(storage), study_name="s")
+    study.ask()
+    report = TrialReport(storage, "s", 0, "val/selection", True, after_trials=1, after_epochs=0)
+    strategy = SimpleNamespace(broadcast=lambda _: "worse than the median")
+    trainer = SimpleNamespace(
+        is_global_zero=False, strategy=strategy, should_stop=False, max_epochs=4, current_epoch=0,
+        callback_metrics={"val/selection": torch.tensor(0.5)}, callbacks=[report],
+    )  # fmt: skip
+    report.setup(trainer, None, "fit")
+    report.on_validation_end(trainer, None)
+    assert trainer.should_stop
+    assert study.trials[0].intermediate_values == {}  # reported by the first process
+    with pytest.raises(PrunedError, match="worse than the median"):
+        raise_if_pruned(trainer)
