@@ -72,13 +72,13 @@ def bounds(hom: Array, near: float) -> tuple[float, float, float, float]:
 @compiled(inline="always")
 def _narrow(first: int, last: int, x0: int, slope: float, least: float) -> tuple[int, int]:
     """Narrow the columns ``first`` to ``last`` to those with ``slope·(column + x0) >= least``."""
-    if slope > 0.0:
-        # Beyond the window's columns the integer conversion could overflow.
-        edge = min(least / slope - x0, last + 1.0)
-        first = max(first, math.ceil(edge - 1e-6))
-    elif slope < 0.0:
-        edge = max(least / slope - x0, first - 1.0)
-        last = min(last, math.floor(edge + 1e-6))
+    if slope != 0.0:
+        # Far beyond the window's columns the integer conversion would overflow.
+        edge = min(max(least / slope - x0, first - 1.0), last + 1.0)
+        if slope > 0.0:
+            first = max(first, math.ceil(edge - 1e-6))
+        else:
+            last = min(last, math.floor(edge + 1e-6))
     return first, last
 
 

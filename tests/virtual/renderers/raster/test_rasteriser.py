@@ -20,6 +20,7 @@ from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.renderers.raster import visibility as shadow_module
 from dopepp.virtual.renderers.raster.visibility import shadow_map
 from dopepp.virtual.scene import Light, Material, Scene, SceneObject
+from dopepp.virtual.triangles import CENTRE_SAMPLE, rasterise
 from tests.virtual.conftest import even_light, pixel_rays
 
 LARGE = {"size": (640, 480), "focal": 600.0}
@@ -65,6 +66,16 @@ def test_plane_has_its_closed_form_depth(scene_of, sheet):
     expected = rotation[:, 2] @ offset / (pixel_rays(scene) @ rotation[:, 2])
     assert (rendered.instances == 0).all()
     np.testing.assert_allclose(rendered.depth, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rise", [-3e-14, 0.0, 3e-14])
+def test_an_edge_along_a_row_may_have_rounding_errors(rise):
+    hom = np.array([[-1e4, 100.5, 1.0], [1e4, 100.5 + rise, 1.0], [0.0, 2e4, 1.0]])
+    drawn, ids = np.zeros((480, 640, 1), np.float32), np.empty((480, 640, 1), np.int32)
+    faces = np.array([[0, 1, 2]], np.int32)
+    rasterise(hom, faces, False, 0.01, (0, 0), CENTRE_SAMPLE, drawn, ids, 0)
+    assert (drawn[101:] == 1).all()
+    assert (drawn[:101] == 0).all()
 
 
 @settings(max_examples=15)
