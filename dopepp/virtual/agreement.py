@@ -12,7 +12,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dopepp.drawing.pictures import Mask, RGBImage, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, transform
@@ -59,9 +59,12 @@ def _contour(
     # A frame of one empty pixel, so that the outline is inside the canvas.
     left, top, right, bottom = box[0] - 1, box[1] - 1, box[2] + 1, box[3] + 1
     inverse_depth, ids = draw_alone(item, projected.hom, (left, top, right, bottom))
-    edges = _edges(item, np.where(inverse_depth > 0, ids, -1))
+    borders = _borders(item, np.where(inverse_depth > 0, ids, -1))
+    edges = borders.any(axis=0)
     rows, columns = np.nonzero(edges)
-    x, y = columns + left, rows + top
+    # The contour lies in the middle between a pixel and its neighbours.
+    right, below = 0.5 * borders[:, rows, columns] / borders[:, rows, columns].sum(axis=0)
+    x, y = columns + left + right, rows + top + below
     inside = (x > 0) & (y > 0) & (x < size[0] - 1) & (y < size[1] - 1)
     normals = _normals(edges)[rows, columns]
     points = np.column_stack([x, y, normals])[inside]
@@ -70,19 +73,24 @@ def _contour(
     return points, max(x1 - x0, y1 - y0)
 
 
-def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:
-    """Return the mask of pixels at the outline or where the normal turns by over 26°."""
+def _borders(
+    item: SceneObject, ids: Int[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "2 height width"]:
+    """Return whether a contour separates each pixel from its right, and from its lower neighbour.
+
+    A contour is the outline, or a crease where the normal turns by over 26°.
+    """
     a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     drawn = normals[ids]
     drawn[ids < 0] = 0.0
-    edges = np.zeros(ids.shape, bool)
-    # Compare every pixel with its lower, then its right neighbour.
-    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+    borders = np.zeros((2, *ids.shape), bool)
+    neighbours = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
+    for border, (first, second) in zip(borders, neighbours, strict=True):
         crease = (drawn[first] * drawn[second]).sum(axis=-1) < 0.9
-        edges[first] |= crease & ((ids[first] >= 0) | (ids[second] >= 0))
-    return edges
+        border[first] = crease & ((ids[first] >= 0) | (ids[second] >= 0))
+    return borders
 
 
 def _normals(edges: Mask) -> Float[np.ndarray, "height width 2"]:
