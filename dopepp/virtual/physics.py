@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
@@ -96,7 +97,7 @@ def settle(
     if path.is_file():
         try:
             poses = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
             fix = "delete this file; the next run creates the file again"
             raise UserError(f"{path}: {error}", "a file written by dopepp", fix) from error
     else:

@@ -119,9 +119,10 @@ def test_a_damaged_cache_is_named(box_part, cache):
     factory.scene(0, 0)
     files = (cache / "dopepp" / "piles").glob("*.npy")
     newest = max(files, key=lambda path: path.stat().st_mtime_ns)
-    newest.write_bytes(newest.read_bytes()[:200])
-    with pytest.raises(UserError, match="delete this file"):
-        factory.scene(0, 0)
+    for content in (newest.read_bytes()[:200], b"", b"PK\3\4"):
+        newest.write_bytes(content)
+        with pytest.raises(UserError, match="delete this file"):
+            factory.scene(0, 0)
     newest.unlink()
 
 
