@@ -108,6 +108,13 @@ def test_a_split_draws_its_photos_only(tmp_path):
     assert not set.intersection(*shown)
 
 
+def test_a_photo_of_one_pixel_has_frames(tmp_path):
+    assert cv2.imwrite(str(tmp_path / "dot.png"), np.full((1, 1, 3), 80, np.uint8))
+    frame, _ = PhotoBackgrounds(tmp_path).frame(np.random.default_rng(0), 0, (64, 48), 0.5)
+    assert frame.shape == (48, 64, 3)
+    assert (frame == 80).all()
+
+
 def test_mixed_backgrounds_draw_a_share_from_the_others(tmp_path):
     assert cv2.imwrite(str(tmp_path / "white.png"), np.full((40, 60, 3), 255, np.uint8))
     mixed = MixedBackgrounds(ProceduralBackgrounds(), PhotoBackgrounds(tmp_path), 0.25)

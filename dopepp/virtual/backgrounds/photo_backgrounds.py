@@ -145,7 +145,7 @@ class PhotoBackgrounds:
             photo, number = self._read(path), number + 1
         (rows, columns), (width, height) = photo.shape[:2], size
         scale = share * min(columns / width, rows / height)
-        crop_width, crop_height = round(width * scale), round(height * scale)
+        crop_width, crop_height = max(round(width * scale), 1), max(round(height * scale), 1)
         left, top = (columns - crop_width) // 2, (rows - crop_height) // 2
         if share < 1:
             left = int(rng.integers(columns - crop_width + 1))
