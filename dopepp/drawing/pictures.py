@@ -76,30 +76,47 @@ _JPEG_END: Final = b"\xff\xd9"
 
 
 def read_picture(path: Path, longest_px: int | None = None, *, upright: bool = True) -> RGBImage:
-    """Read an image in one of :data:`FORMATS` as RGB.
+    """Read an image in one of :data:`FORMATS` as RGB; of 16 bits, the upper eight are kept.
 
     Images with a side above ``longest_px`` are downscaled; a JPEG is then decoded at a reduced
     size, which is faster. ``upright`` applies the EXIF orientation.
 
     Raises:
-        ValueError: The file is missing, damaged or not an image, or exceeds :data:`MAX_SIDE`.
+        ValueError: The file is missing, damaged or not an image, exceeds :data:`MAX_SIDE`, or its
+            values do not have 8 or 16 bits.
     """
     try:
-        with _open(read_limited(path, MAX_BYTES), FORMATS) as image:
+        content = read_limited(path, MAX_BYTES)
+        with _open(content, FORMATS) as image:
             if max(image.size) > MAX_SIDE:
                 raise ValueError(f"{image.width}×{image.height} pixels")
             scale = 1.0 if longest_px is None else longest_px / max(image.size)
             if scale >= 1:
-                pixels = image.convert("RGB")
+                pixels = as_rgb(image, content)
             else:
                 size = (max(round(image.width * scale), 1), max(round(image.height * scale), 1))
                 image.draft("RGB", size)
-                pixels = image.convert("RGB").resize(size, Image.Resampling.BOX)
+                pixels = as_rgb(image, content).resize(size, Image.Resampling.BOX)
             if upright:
                 ImageOps.exif_transpose(pixels, in_place=True)
             return np.asarray(pixels)
     except Exception as error:  # PIL raises a different type for every way to be damaged
         raise ValueError(_reason(error)) from error
+
+
+def as_rgb(image: Image.Image, content: bytes) -> Image.Image:
+    """Return an image with the file's ``content`` as 8-bit RGB; of 16 bits, the upper eight.
+
+    Raises:
+        ValueError: The values do not have 8 or 16 bits.
+    """
+    if image.mode[0] not in "IF":  # Pillow keeps the upper eight of 16 bits in colours only
+        return image.convert("RGB")
+    if not _is_deep(image, content):
+        raise ValueError(f"values of mode {image.mode}, not of 8 or 16 bits")
+    grey = Image.fromarray((np.asarray(image, np.uint16) >> 8).astype(np.uint8))
+    grey.info = image.info
+    return grey.convert("RGB")
 
 
 def whole_image(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:

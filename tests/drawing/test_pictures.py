@@ -116,7 +116,14 @@ def test_photos_of_8_and_16_bits(tmp_path, image, suffix, channels, kind):
     path = tmp_path / f"photo{suffix}"
     cv2.imwrite(str(path), wide[..., [2, 1, 0, 3][:channels]] if channels > 2 else wide)
     expected = image if channels > 1 else image[..., [0, 0, 0]]
-    np.testing.assert_array_equal(read_photo(path), expected)
+    for read in (read_photo, read_picture, read_texture):
+        np.testing.assert_array_equal(read(path), expected)
+
+
+def test_pictures_of_other_depths_are_refused(tmp_path):
+    Image.fromarray(np.full((4, 6), 0.5, np.float32)).save(tmp_path / "float.tiff")
+    with pytest.raises(ValueError, match="not of 8 or 16 bits"):
+        read_picture(tmp_path / "float.tiff")
 
 
 SAVE = "fix: save it as PNG, e.g. with ImageMagick: magick"

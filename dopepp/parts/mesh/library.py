@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import whole_image
+from dopepp.drawing.pictures import as_rgb, whole_image
 from dopepp.geometry.camera import Transform
 from dopepp.parts.mesh import Vertices, weld
 from dopepp.parts.part import RawMesh
@@ -168,10 +168,10 @@ def read_glb(path: Path) -> RawMesh:
         view = header["bufferViews"][header["images"][number]["bufferView"]]
         start = view.get("byteOffset", 0)
         try:
-            image = whole_image(binary[start : start + view["byteLength"]])
+            content = binary[start : start + view["byteLength"]]
+            texture = np.asarray(as_rgb(whole_image(content), content))
         except ValueError as error:
             raise ValueError(f"a texture that cannot be read: {error}") from error
-        texture = np.asarray(image.convert("RGB"))
     # trimesh would open images of any kind; texture coordinates only need a material.
     header |= {"images": [], "materials": [{} for _ in header.get("materials", ())]}
     mesh, _ = read_scene(_packed(header, binary), "glb")
