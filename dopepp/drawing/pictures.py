@@ -338,7 +338,9 @@ class VideoFile(AbstractContextManager["VideoFile"]):
         if (even.shape[1], even.shape[0]) != self._size:
             even = np.asarray(cv2.resize(even, self._size, interpolation=cv2.INTER_AREA))
         until = round((time - self._start) * self._rate) + 1
-        until = min(until, self._written + max(1, round(LONGEST_GAP_S * self._rate)))
+        if (late := until - self._written - max(1, round(LONGEST_GAP_S * self._rate))) > 0:
+            until -= late
+            self._start += late / self._rate  # the images that follow are not late
         if self._written < until and shutil.disk_usage(self.path.parent).free < MIN_FREE:
             raise RunError(f"no space left for {self.path}; delete files on this disk")
         frame = cv2.cvtColor(even, cv2.COLOR_RGB2BGR)

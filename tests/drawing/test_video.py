@@ -23,13 +23,13 @@ def level(number, size=(48, 32)):
 
 def test_images_are_shown_at_their_times(tmp_path):
     with VideoFile(tmp_path / "new" / "clip.mp4", 10) as video:
-        for number, time in enumerate((7.0, 7.1, 7.4, 7.41, 99.0)):
+        for number, time in enumerate((7.0, 7.1, 7.4, 7.41, 99.0, 99.1, 99.3)):
             video.write(level(number), time)
         assert not video.path.exists()
     shown = [round(frame.mean() / 20) for frame in frames(video.path)]
-    # The third image is late and repeated; the fourth falls on an occupied frame; the last is
-    # repeated for two seconds only, although it is a minute and a half late.
-    assert shown == [0, 1, 2, 2, 2, *[4] * 20]
+    # The third image is late and repeated; the fourth falls on an occupied frame; the fifth is
+    # repeated for two seconds only, although it is a minute and a half late, and then time goes on.
+    assert shown == [0, 1, 2, 2, 2, *[4] * 20, 5, 6, 6]
     assert [path.name for path in video.path.parent.iterdir()] == ["clip.mp4"]
 
 
