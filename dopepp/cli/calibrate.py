@@ -144,8 +144,12 @@ def bench(
     from dopepp.robot.calibration.tool import find_bench
 
     pose_format = _pose_format(unit, angles, quaternion, direction)
+    for_board = {"--camera": camera, "--hand-eye": hand_eye, "--poses": poses}
     if board is not None:
         result, names = _bench_from_board(source, board, camera, hand_eye, poses, pose_format)
+    elif given := [word for word, path in for_board.items() if path is not None]:
+        problem, fix = f"{' and '.join(given)} without --board", "add --board, or leave them out"
+        raise UserError(problem, "these options with images of a board", fix)
     elif source.is_dir():
         problem = f"{source}, which is a folder, without --board"
         fix = "describe the board, e.g. --board charuco:8x11:20:15"

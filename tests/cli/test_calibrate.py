@@ -153,6 +153,7 @@ def test_a_bench_is_calibrated_from_a_board_on_it(run, refused, cell, tmp_path):
         (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),
         (("bench", "none.csv", "--out", "t.yaml"), "none.csv"),
         (("bench", ".", "--out", "t.yaml"), "without --board"),
+        (("bench", "b.csv", "--camera", "c.yaml", "--out", "t.yaml"), "--camera without --board"),
         (("camera", "none.mp4", "--board", SPEC, "--out", "c.yaml"), "none.mp4"),
         (("tcp", "none.csv", "--out", "t.yaml", "--angles", "grad"), "--angles grad"),
     ],
