@@ -208,8 +208,12 @@ class TemplateEstimator(PoseEstimator):
             group += map(again, refine(starts))
             turn = partial(self._in_best_turn, image=image, K=K, refine=refine)
             least = self.levels.get(detector.part.name, 0.0)
+            found: list[Detection] = []  # best first
             for end in self._without_look_alikes(group, image, K):
-                ends.append(turn(end) if log_odds(_probability(end)) > least else end)
+                is_best = not any(are_same(end, better) for better in found)
+                is_reported = is_best and log_odds(_probability(end)) > least
+                found.append(turn(end) if is_reported else end)
+            ends += found
         return ends
 
     def _refined_once(
