@@ -144,6 +144,7 @@ class Factory:
             shift = approach(composition.objects, scale)
             lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
             table_image = preset.table.draw_image(rng, backgrounds, K, size, T_cam_table)
+            table_image = replace(table_image, end=table_image.end + float(shift[2]))
             T_cam_table = _shift(T_cam_table, shift)
             plane = plane_of(T_cam_table)
             if plane.offset >= 0:

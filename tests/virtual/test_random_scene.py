@@ -110,6 +110,32 @@ def test_the_image_on_a_table_does_not_move(scale):
     assert np.quantile(differences, 0.95) <= 6
 
 
+class Plain:
+    """Images of one random grey."""
+
+    def draw(self, rng, width, height):
+        return np.full((height, width, 3), rng.integers(256), np.uint8)
+
+
+def end_of_table(scene):
+    """Least and largest depth at which the table may end, behind the first target, metres."""
+    column = scene.background[:, 80, 0]
+    first = int(np.flatnonzero(column == column[-1])[0])  # row of the table
+    row = scene.plane.inverse_depth_row(scene.K)
+    near, far = (1 / max(row @ [80, v, 1], 1e-9) for v in (first, first - 1))
+    return near - centre(scene.objects[0])[2], far - centre(scene.objects[0])[2]
+
+
+@pytest.mark.parametrize("scale", [0.05, 0.5, 4.0])
+def test_the_end_of_a_table_does_not_move(scale):
+    preset = preset_of("table", {"table": {"elevation_deg": [10.0, 12.0], "roll_deg": 0.0}})
+    flat = Factory([servoholder()], preset.resized(160, 120), 1, Plain())
+    for index in range(3):
+        ends = [end_of_table(flat.scene(0, index, level)) for level in (1.0, scale)]
+        (near, other_near), (far, other_far) = zip(*ends, strict=True)
+        assert max(near, other_near) <= min(far, other_far)
+
+
 def test_without_a_part_the_camera_stays():
     objects = (item for scene in scenes("wide", 1) for item in scene.objects)
     distractors = [item for item in objects if not item.is_target]
