@@ -172,7 +172,7 @@ def _bitmap(
 
 def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
     """Return the texture level with texels about half as large as the object's pixels."""
-    surface, depth = item.surface, float(item.T_cam_obj[2, 3])
+    surface, depth = item.surface, float(item.centre[2])
     assert surface.texture is not None
     levels = surface.texture.levels
     a, b, c = surface.uv[surface.faces].transpose(1, 2, 0)

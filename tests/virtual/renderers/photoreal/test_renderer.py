@@ -18,6 +18,7 @@ from dopepp.parts.mesh.read import read_mesh
 from dopepp.virtual import PRESETS, Factory, make_surface, render
 from dopepp.virtual.renderers import find_renderer, renderer_identity
 from dopepp.virtual.renderers.photoreal import mitsuba
+from dopepp.virtual.renderers.photoreal.mitsuba_scene import _texture_level
 from dopepp.virtual.scene import Grooves, Light, Material, Panel, Plane, SceneObject
 from tests.parts.makers import mesh_of
 from tests.virtual.conftest import even_light
@@ -112,6 +113,15 @@ def test_a_textured_model_shows_its_texture(photoreal, ycb_root, scene_of):
     assert_same_labels(result, expected)
     covered = expected.instances == 0
     assert min(likeness(expected.image[covered], result.image[covered])) > 0.9
+
+
+def test_a_texture_has_the_same_level_for_any_origin(ycb_root):
+    mesh, levels = read_mesh(ycb_root / "models" / "003_cracker_box" / "textured.obj", "m"), set()
+    for offset in (0.0, 3.0, -3.0):
+        moved = make_surface(replace(mesh, vertices=mesh.vertices + np.array([0, 0, offset])))
+        item = SceneObject(moved, make_transform(np.eye(3), [0, 0, 0.5 - offset]))
+        levels.add(_texture_level(item, PRESETS["ycb"].K))
+    assert len(levels) == 1
 
 
 def test_no_light_at_all_is_black_and_finite(photoreal, box_part, scene_of):
