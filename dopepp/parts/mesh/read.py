@@ -287,7 +287,7 @@ def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"
     # Measured from the body's own centre, an open surface has a meaningful sign too.
     a, b, c = (positions[corners] - ((lower + upper) / 2)[bodies][:, None]).swapaxes(0, 1)
     volumes = np.bincount(bodies, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
-    is_body = ~_find_enclosed(lower, upper, np.flatnonzero(volumes < 0)[:MANY_CAVITIES])
+    is_body = ~_find_enclosed(lower, upper, np.flatnonzero(volumes < 0))
     extents = (upper - lower)[is_body]
     return list(extents[np.argsort(-extents.prod(axis=1), kind="stable")])
 
@@ -307,9 +307,9 @@ def _find_enclosed(
     upper: Float[np.ndarray, "bodies 3"],
     candidates: Int[np.ndarray, " candidates"],
 ) -> Bool[np.ndarray, " bodies"]:
-    """Mark the candidates whose box lies in the box of another body."""
+    """Mark the first ``MANY_CAVITIES`` candidates whose box lies in the box of another body."""
     enclosed = np.zeros(len(lower), bool)
-    for body in candidates:
+    for body in candidates[:MANY_CAVITIES]:
         around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
         enclosed[body] = around.any()
     return enclosed

@@ -9,7 +9,7 @@ from trimesh.exchange.stl import export_stl
 
 from dopepp.parts import read_mesh, servoholder
 from dopepp.parts.mesh import weld
-from dopepp.parts.mesh.read import find_topology, flip_faces, misoriented_faces
+from dopepp.parts.mesh.read import MANY_CAVITIES, find_topology, flip_faces, misoriented_faces
 
 
 def arrays(*meshes):
@@ -74,6 +74,16 @@ def test_every_body_is_repaired_by_itself_and_a_cavity_stays():
     np.testing.assert_array_equal(repaired(vertices, faces), faces)
     mixed = flip_faces(faces, np.arange(len(faces)) % 7 == 0)
     assert cyclic(repaired(vertices, mixed)) == cyclic(faces)
+
+
+def test_cavities_beyond_the_limit_count_as_bodies():
+    block, pore = trimesh.creation.box((50, 50, 50)), trimesh.creation.icosahedron()
+    pore.invert()
+    grid = np.stack(np.meshgrid(*[np.arange(11) * 4.0 - 20] * 3), axis=-1).reshape(-1, 3)
+    pores = [pore.copy().apply_translation(place) for place in grid]
+    vertices, faces = arrays(block, *pores)
+    changed = (repaired(vertices, faces) != faces).any(axis=1).sum()
+    assert changed == 20 * (len(grid) - MANY_CAVITIES)
 
 
 def test_one_body_of_several_that_faces_inwards_is_flipped():
