@@ -22,6 +22,7 @@ from dopepp.experiment.assembly.build_sources import held_out_source
 from dopepp.experiment.assembly.photos import held_out_photos, negative_photos
 from dopepp.experiment.config.data_config import DataConfig
 from dopepp.geometry.camera import crop_camera
+from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.lookalikes import lookalikes
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import PhotoBackgrounds, find_backgrounds
@@ -133,7 +134,7 @@ def _distances(preset: Preset, parts: Parts) -> tuple[float, float]:
     rng, depths = np.random.default_rng(0), []
     for part in parts:
         for _ in range(_NUM_POSES):
-            points = part.points @ preset.turning.draw(rng).T
+            points = (part.points - part.cuboid[CENTROID]) @ preset.turning.draw(rng).T
             size = preset.width, preset.height
             depth = float(preset.placement.draw(rng, preset.K, size, points)[2])
             depths.append(depth + float(points[:, 2].min() + points[:, 2].max()) / 2)

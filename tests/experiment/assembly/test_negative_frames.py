@@ -1,6 +1,7 @@
 """Frames without the part: sizes, kinds and photos."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,10 +16,13 @@ from dopepp.experiment.assembly.negative_frames import (
     OWN,
     PHOTOS,
     SCENES,
+    _distances,
     negative_frames,
 )
 from dopepp.experiment.assembly.photos import held_out_photos, training_backgrounds
 from dopepp.experiment.run.described_images import describe_images, differing_images
+from dopepp.parts import make_part, servoholder
+from dopepp.virtual import PRESETS
 
 pytestmark = pytest.mark.usefixtures("quick_sky")
 
@@ -55,6 +59,14 @@ def test_frames_of_a_preset_are_large_and_alternate_between_kinds(tiny, photos):
     others = [frames(config, "test", 4).sample(index) for index in range(4)]
     assert not {sample.key for sample in samples[::3]} & {sample.key for sample in others[::3]}
     assert all((a.image != b.image).any() for a, b in zip(samples, others, strict=True))
+
+
+def test_distances_do_not_depend_on_the_origin_of_the_mesh():
+    part, preset = servoholder(), PRESETS["wide"]
+    mesh = replace(part.mesh, vertices=part.mesh.vertices + np.array([0.5, -0.3, 0.2]))
+    near, far = _distances(preset, [make_part("moved", mesh)])
+    np.testing.assert_allclose((near, far), _distances(preset, [part]), atol=0.01)
+    assert 0.1 < near < far < 0.27
 
 
 def test_frames_have_size_and_matrix_of_the_camera(tiny):
