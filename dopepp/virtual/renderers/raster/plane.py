@@ -55,7 +55,9 @@ def darken_plane(
     if sky is None:
         return
     grid, hidden = sky
-    box = _shadowed_box(scene, frame, grid, hidden.shape, lights)
+    casts = [_soft_shadow(plane, shadow) for shadow in lights]
+    blurs = [margin * shadow.texel for shadow, (_, margin) in zip(lights, casts, strict=True)]
+    box = _shadowed_box(scene, frame, grid, hidden.shape, lights, blurs)
     if box is None:
         return
     inverse = plane.inverse_depth_row(scene.K)
@@ -65,8 +67,7 @@ def darken_plane(
     to_plane = np.vstack([frame[:2] @ to_point, inverse])
     shades = scratch("shades", (1 + len(lights), box[3] - box[1], box[2] - box[0]), np.float32)
     _warp(hidden, to_cells @ to_plane, box, shades[0])
-    for shadow, shade in zip(lights, shades[1:], strict=True):
-        cast, margin = _soft_shadow(plane, shadow)
+    for shadow, (cast, margin), shade in zip(lights, casts, shades[1:], strict=True):
         to_map = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]]) @ shadow.P
         _warp(cast, to_map @ to_point, box, shade)
     lit = _LitPlane(
@@ -124,13 +125,17 @@ def _shadowed_box(
     grid: Vector,
     cells: tuple[int, ...],
     lights: Sequence[ShadowMap],
+    blurs: Sequence[float],
 ) -> Box | None:
-    """Return the box of pixels that shadows may darken, or None."""
+    """Return the box of pixels that shadows may darken, or None.
+
+    ``blurs`` are the widths by which shadows are blurred, metres per metre of distance to the lamp.
+    """
     size = scene.size
     right, bottom = grid[0] + cells[1] * grid[2], grid[1] + cells[0] * grid[2]
     corners = np.array([(x, y, 0.0) for x in (grid[0], right) for y in (grid[1], bottom)])
     spots = [(corners - frame[:, 3]) @ frame[:, :3]]
-    for lamp in (shadow.light[:3] for shadow in lights):
+    for lamp, blur in zip((shadow.light[:3] for shadow in lights), blurs, strict=True):
         lamp_height = lamp @ frame[2, :3] + frame[2, 3]
         for item in scene.objects:
             hull = transform(item.T_cam_obj, item.surface.hull)
@@ -141,7 +146,11 @@ def _shadowed_box(
             if (height[above] >= 0.999 * lamp_height).any():
                 return 0, 0, *size  # the shadow has no end
             stretch = lamp_height / (lamp_height - height[above])
-            spots.append(lamp + stretch[:, None] * (hull[above] - lamp))
+            ends = lamp + stretch[:, None] * (hull[above] - lamp)
+            # A blur is longest along the light, where the plane stretches it.
+            reach = blur * np.square(ends - lamp).sum(axis=1, keepdims=True) / lamp_height
+            along, across = frame[:2, :3]
+            spots += [ends + reach * (i * along + j * across) for i in (-1, 1) for j in (-1, 1)]
     points = np.concatenate(spots)
     if (points[:, 2] <= NEAR).any():
         return 0, 0, *size
@@ -185,7 +194,7 @@ def hidden_sky(
     for item, points in zip(objects, heights, strict=True):
         splats[:] = 0
         # Half the side of a splat, so wide that splats leave no gaps.
-        reach = max(0.8 * item.surface.spacing / cell, 0.5)
+        reach = min(max(0.8 * item.surface.spacing / cell, 0.5), 80.0)
         _splat(points, reach, slopes, grid, splats)
         # Erode by the splats' overhang.
         cells = round(reach - 0.5)

@@ -9,6 +9,7 @@ import trimesh
 from dopepp.geometry.camera import make_transform, project
 from dopepp.virtual import make_surface, render
 from dopepp.virtual.renderers.raster import visible_fractions
+from dopepp.virtual.renderers.raster.plane import hidden_sky
 from dopepp.virtual.scene import Ambient, Light, Plane, SceneObject
 from tests.parts.makers import mesh_of
 from tests.virtual.conftest import even_light, pixel_rays
@@ -105,6 +106,23 @@ def test_a_shadow_lies_where_the_light_is_blocked(scene_of, which):
         outer = on_plane(0.4 * stretch + 1.5 * half * dx, -0.1 * stretch + 1.5 * half * dy, 0)
         assert brightness(rendered, outer) == 90
         assert brightness(rendered, inner) < 15
+
+
+def test_the_end_of_a_long_shadow_is_soft(scene_of):
+    down = np.diag([1.0, -1.0, -1.0])  # the end of the shadow is parallel to the image's columns
+    surface = make_surface(mesh_of(trimesh.creation.box((0.06, 0.06, 0.12))))
+    item = SceneObject(surface, make_transform(down, [-0.12, 0.0, 0.54]))
+    scene = scene_of(item, lights=(Light((-1.42, 0.0, -0.15)),), ambient=DARK, **IMAGE)
+    row = render(replace(scene, plane=Plane((0.0, 0.0, -1.0), -0.6))).image[120, :, 1].astype(int)
+    assert row.min() < 10
+    assert row[row < 90].max() > 85  # no step to the background's 90
+
+
+def test_the_tip_of_an_object_below_the_plane_is_quick():
+    ball = make_surface(mesh_of(trimesh.creation.icosphere(4, 0.05)))
+    tip = SceneObject(ball, make_transform(np.eye(3), [0, 0, 2e-5 - ball.points[:, 2].max()]))
+    _, hidden = hidden_sky(np.eye(3, 4), [tip])
+    assert 0 <= hidden.min() <= hidden.max() <= 1
 
 
 def test_light_of_unblocked_lamps_remains(scene_of):
