@@ -60,11 +60,11 @@ def _contour(
     left, top, right, bottom = box[0] - 1, box[1] - 1, box[2] + 1, box[3] + 1
     inverse_depth, ids = draw_alone(item, projected.hom, (left, top, right, bottom))
     borders = _borders(item, np.where(inverse_depth > 0, ids, -1))
-    edges = borders.any(axis=0)
+    edges = np.logical_or(*borders)
     rows, columns = np.nonzero(edges)
     # The contour lies in the middle between a pixel and its neighbours.
-    right, below = 0.5 * borders[:, rows, columns] / borders[:, rows, columns].sum(axis=0)
-    x, y = columns + left + right, rows + top + below
+    beside, below = 0.5 * borders[:, rows, columns] / borders[:, rows, columns].sum(axis=0)
+    x, y = columns + left + beside, rows + top + below
     inside = (x > 0) & (y > 0) & (x < size[0] - 1) & (y < size[1] - 1)
     normals = _normals(edges)[rows, columns]
     points = np.column_stack([x, y, normals])[inside]
@@ -86,8 +86,10 @@ def _borders(
     drawn = normals[ids]
     drawn[ids < 0] = 0.0
     borders = np.zeros((2, *ids.shape), bool)
-    neighbours = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
-    for border, (first, second) in zip(borders, neighbours, strict=True):
+    for border, (first, second) in (
+        (borders[0], (np.s_[:, :-1], np.s_[:, 1:])),
+        (borders[1], (np.s_[:-1], np.s_[1:])),
+    ):
         crease = (drawn[first] * drawn[second]).sum(axis=-1) < 0.9
         border[first] = crease & ((ids[first] >= 0) | (ids[second] >= 0))
     return borders
