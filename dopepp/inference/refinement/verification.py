@@ -169,8 +169,8 @@ class Verifier:
         """Compare poses of look-alikes: by how much the lines of one fit better than of another.
 
         The poses share most lines, so their probabilities are nearly equal. Only lines that are
-        apart from the lines of the other pose distinguish them, e.g. the edges of a small hole. A
-        pose without such lines has half the mean response of the shared lines.
+        apart from the lines of the other pose distinguish them, e.g. the edges of a small hole. For
+        a pose without such lines, half the mean response of the shared lines is used.
 
         Args:
             image: RGB.
@@ -219,7 +219,8 @@ class Verifier:
         if any(at is None for at in drawn):
             return None
         pixels = np.concatenate([at.pixels for at in drawn if at is not None])
-        corners = np.array([pixels.min(axis=0), pixels.max(axis=0)])
+        pixels = pixels.T.copy()  # numpy reduces long rows much faster than long columns
+        corners = np.array([pixels.min(axis=1), pixels.max(axis=1)])
         try:
             return crop_around(image, K, corners, longest_px)
         except UndecidedError:
@@ -256,17 +257,10 @@ class Verifier:
             covariance: Covariance of the pose, as in :class:`PartRefiner`; camera axes.
             moved: Mahalanobis distance from the pose before refinement.
         """
-        at = posed(self.mesh, T_cam_obj, K)
-        if at is None:
+        crop = self._crop_of([T_cam_obj], image, K, LONGEST_PX)
+        at = None if crop is None else posed(self.mesh, T_cam_obj, crop.K)
+        if crop is None or at is None:
             return None
-        pixels = at.pixels.T.copy()  # numpy reduces long rows much faster than long columns
-        corners = np.array([pixels.min(axis=1), pixels.max(axis=1)])
-        try:
-            crop = crop_around(image, K, corners, LONGEST_PX)
-        except UndecidedError:
-            return None
-        at = posed(self.mesh, T_cam_obj, crop.K)
-        assert at is not None
         ids = self._edges.drawn(at, crop.size)
         mask = (ids >= 0).astype(np.uint8)
         spacing = max(1.5, 3.0 * crop.extent / SPACING)
