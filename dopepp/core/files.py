@@ -70,7 +70,9 @@ def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
     if suffixes and path.suffix.lower() not in suffixes:
         problem = f"{path}, which is a folder" if path.is_dir() else f"{path} to write"
         allowed = f"a file with one of the suffixes {', '.join(suffixes)}"
-        raise UserError(problem, allowed, f"pass e.g. {path.stem or 'file'}{suffixes[0]}")
+        raise UserError(
+            problem, allowed, f"pass e.g. {path.stem.strip('.') or 'file'}{suffixes[0]}"
+        )
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))

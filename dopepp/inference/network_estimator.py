@@ -129,7 +129,7 @@ class NetworkEstimator(PoseEstimator):
         return set(self._names) <= set(probable)
 
     def _searched_depths(self, view: NetworkView) -> list[tuple[float, float] | None] | None:
-        """Return the depths at which :func:`recover` searches each part, metres.
+        """Return the depths at which :func:`.recover_batch` searches each part, metres.
 
         A part has None if its training distances are unknown. Without verification, which chooses
         between the poses, nothing is searched, and the result is None.

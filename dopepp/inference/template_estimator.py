@@ -47,7 +47,7 @@ NUM_REFINED: Final = 20  # number of start poses of each part that are refined
 NUM_REPEATED: Final = 6  # number of distinct poses that are refined again, the most probable
 REPEATS: Final = 2  # number of further refinements
 MAX_DIFFERENCE: Final = 2.0  # difference of log odds below which look-alikes are compared
-NEIGHBOURS: Final = 7  # turns that a turn with a high response is compared with
+NEIGHBOURS: Final = 7  # number of adjacent turns, of which the one with the best response counts
 MIN_TURN: Final = math.radians(45.0)  # smallest rotation between the poses of look-alikes
 
 # Limits of the working distance, diameters. A nearer part surrounds the camera. A farther part is
@@ -207,12 +207,12 @@ class TemplateEstimator(PoseEstimator):
             starts = [detector.start(T_cam_obj, best.score, K) for T_cam_obj in turned]
             group += map(again, refine(starts))
             turn = partial(self._in_best_turn, image=image, K=K, refine=refine)
-            least = self.levels.get(detector.part.name, 0.0)
+            least = self.levels.get(detector.part.name, 0.0)  # score 0.5
             found: list[Detection] = []  # best first
             for end in self._without_look_alikes(group, image, K):
-                is_best = not any(are_same(end, better) for better in found)
-                is_reported = is_best and log_odds(_probability(end)) > least
-                found.append(turn(end) if is_reported else end)
+                if not any(are_same(end, better) for better in found):
+                    is_probable = log_odds(_probability(end)) > least
+                    found.append(turn(end) if is_probable else end)
             ends += found
         return ends
 
@@ -289,7 +289,8 @@ class TemplateEstimator(PoseEstimator):
             for ring, values in zip(turned, responses, strict=True):
                 is_peak = values >= maximum_filter(values, NEIGHBOURS, mode="wrap")
                 is_peak &= values > max(map(np.max, responses)) - MIN_DIFFERENCE / 2
-                poses += [ring[index] for index in np.flatnonzero(is_peak)]
+                best_turns = [ring[index] for index in np.flatnonzero(is_peak)]
+                poses += [turn for turn in best_turns if not np.allclose(turn, end.T_cam_obj)]
             if len(poses) == 1:
                 return end
             margins = verifier.margins(image, K, poses)
@@ -298,7 +299,7 @@ class TemplateEstimator(PoseEstimator):
         if chosen > 0:
             start = detector.start(poses[chosen], end.score, K)
             (new,) = refine([replace(start, covariance=end.covariance)])
-            end = replace(new, kept="")
+            end = replace(new, kept="")  # the pose was refined before the turn
         rivals = [poses[index] for index in np.flatnonzero(margins[chosen] < MIN_DIFFERENCE)]
         steps = np.array([step_between(end.T_cam_obj, rival) for rival in rivals]).reshape(-1, 6)
         return replace(end, covariance=end.covariance + steps.T @ steps / (len(steps) + 1))

@@ -31,7 +31,8 @@ class MapLoss(nn.Module, ABC):
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return the weighted terms of one stage per image; the loss is the mean of their sums.
 
-        The method is also called under ``torch.vmap``, so it must not branch on values.
+        The method is also called under ``torch.vmap``, so it must not
+        branch on values, index by a mask or write into tensors in place.
         """
 
     def forward(

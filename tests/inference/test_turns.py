@@ -1,5 +1,6 @@
 """Turns of nearly round parts: which parts have them, and how the right one is chosen."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from dopepp.inference.template_estimator import TemplateEstimator
 from dopepp.inference.templates.detector import TemplateDetector
 from dopepp.inference.templates.turns import nearly_round_turns
 from dopepp.parts.part import Mesh, make_part
-from dopepp.parts.symmetry_finder import axis_rotation
+from dopepp.parts.symmetry_finder import axis_rotation, find_symmetries
 
 K = camera_matrix(900, 900, 319.5, 239.5)
 DISTANCES = (0.1, 0.2)
@@ -45,8 +46,9 @@ def of_trimesh(mesh: trimesh.Trimesh) -> Mesh:
     return Mesh(np.asarray(mesh.vertices), mesh.faces.astype(np.int32))
 
 
-WHOLE_TURNS = np.array([axis_rotation(Z, angle) for angle in np.arange(0, 6.28, 0.02)])
 TEETH = np.array([axis_rotation(Z, number * TOOTH) for number in range(12)])
+SIDES = TEETH @ axis_rotation(np.array([1.0, 0.0, 0.0]), np.pi)
+CYLINDER = of_trimesh(trimesh.creation.cylinder(0.02, 0.01))
 
 
 @pytest.mark.parametrize(
@@ -54,10 +56,10 @@ TEETH = np.array([axis_rotation(Z, number * TOOTH) for number in range(12)])
     [
         (wheel(missing=True), ALONE, [180]),
         (wheel(missing=False), TEETH, [15]),
-        (of_trimesh(trimesh.creation.cylinder(0.02, 0.01)), ALONE, [180, 180]),
-        (of_trimesh(trimesh.creation.cylinder(0.02, 0.01)), TEETH, [15, 15]),
+        (CYLINDER, ALONE, [180, 180]),
+        (CYLINDER, TEETH, [15, 15]),
+        (CYLINDER, np.concatenate([TEETH, SIDES]), [15]),
         (of_trimesh(trimesh.creation.cone(0.02, 0.03)), ALONE, [180]),  # one side
-        (of_trimesh(trimesh.creation.cone(0.02, 0.03)), WHOLE_TURNS, []),
         (of_trimesh(trimesh.creation.box((0.04, 0.03, 0.02))), ALONE, []),
     ],
 )
@@ -71,6 +73,18 @@ def test_turns_of_nearly_round_parts(mesh, symmetries, counts):
         np.testing.assert_allclose(np.abs(axes), np.tile(Z, (len(axes), 1)), atol=1e-9)
         steps = rotation_angle(turns[1:] @ np.swapaxes(turns[:-1], 1, 2))
         np.testing.assert_allclose(steps, np.radians(2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("sections", [32, 12])
+def test_symmetric_turns_are_no_turns(sections):
+    """A cylinder has no turn; a prism of 12 sides has turns of at most half a side."""
+    part = make_part("part", of_trimesh(trimesh.creation.cylinder(0.02, 0.01, sections=sections)))
+    discrete, continuous = find_symmetries(part.mesh)
+    part = replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
+    pose = make_transform(np.eye(3), np.array([0.0, 0.0, 0.15]))
+    turned = TemplateDetector(part, DISTANCES).turned(pose)
+    assert [len(poses) for poses in turned] == ([] if continuous else [15])
+    assert bool(continuous) == (sections == 32)
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +134,17 @@ def test_an_undecided_turn_is_in_the_covariance():
     assert deviations[1] < 10
     assert abs(axes[:, 2] @ truth[:3, 2]) > 0.95  # about the wheel's axis
     assert turned.probability >= end.probability - 0.2
+
+
+def test_each_probable_instance_is_turned_once(detector):
+    tilt = rotation_vector_to_matrix(np.array([0.6, 0.1, 0.0]))
+    places = [make_transform(tilt, np.array([x, 0.0, 0.15])) for x in (-0.03, 0.03)]
+    first, second = (shaded(detector, place) for place in places)
+    image = np.where(second == 90, first, second)
+    wrong = make_transform(axis_rotation(Z, 5 * TOOTH), np.zeros(3))
+    starts = [detector.start(place @ wrong, 0.9, K) for place in places]
+    ends = TemplateEstimator([detector], DISTANCES).refined(starts, image, K)
+    for place in places:
+        near = [end for end in ends if np.linalg.norm(end.T_cam_obj[:3, 3] - place[:3, 3]) < 0.01]
+        (end,) = near
+        assert np.degrees(rotation_angle(end.T_cam_obj[:3, :3].T @ place[:3, :3])) < 1.5

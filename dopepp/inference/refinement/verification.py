@@ -179,7 +179,7 @@ class Verifier:
 
         Returns:
             Mean response of the distinguishing lines of the first pose (row) minus that of the
-            second (column). A pose should be preferred from :data:`MIN_DIFFERENCE` on. All entries
+            second (column). A pose should be preferred above :data:`MIN_DIFFERENCE`. All entries
             are 0 if the part is not on the image.
         """
         margins = np.zeros((len(poses), len(poses)))

@@ -97,8 +97,11 @@ class TemplateDetector:
         self._centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, max_step=0.1)
         self._half_turns = _half_turns(self._centre, group)
-        round_turns = nearly_round_turns(part.mesh, self._centre, part.diameter, group[:, :3, :3])
-        self._round_turns = [rotations_about(self._centre, turns) for turns in round_turns]
+        self._round_turns = []
+        if not part.symmetries_continuous:  # with these, a turn is a symmetry
+            rotations, extent = group[:, :3, :3], part.diameter
+            turns = nearly_round_turns(part.mesh, self._centre, extent, rotations)
+            self._round_turns = [rotations_about(self._centre, it) for it in turns]
         rotations = view_rotations(tilt_deg, group[:, :3, :3])
         # Near the camera, the perspective of a part changes strongly with its distance.
         nearness = np.minimum(part.diameter / np.array(working_distance), 1 / NEAREST)
@@ -190,10 +193,11 @@ class TemplateDetector:
         Poses beyond the largest tilt are omitted; other parts have no list.
         """
         largest = math.radians(self._tilt_deg)
-        turned = [list(T_cam_obj @ turns) for turns in self._round_turns]
-        return [
-            kept for poses in turned if (kept := [it for it in poses if self._tilt(it) <= largest])
+        turned = [
+            [pose for pose in T_cam_obj @ turns if self._tilt(pose) <= largest]
+            for turns in self._round_turns
         ]
+        return [poses for poses in turned if poses]
 
     def _tilt(self, T_cam_obj: Transform) -> float:
         """Return the angle between the part's z axis and the direction to the camera, radians."""

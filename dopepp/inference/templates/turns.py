@@ -33,17 +33,16 @@ def nearly_round_turns(
     """Return turns of a part that hardly change its surface, an array for each axis and side.
 
     An axis of the part's box counts if every turn about it is :data:`NEARLY_ROUND`, alone or after
-    a half turn to the other side. Of turns that a symmetry makes equal, only the smallest is
-    returned. A part whose symmetries contain all turns therefore has none.
+    a half turn to the other side. Of all turns that symmetries make equal, only one is returned.
 
     Args:
         mesh: Mesh of the part, metres.
         centre: Centre of the box, metres.
         diameter: Diameter of the part, metres.
-        symmetries: Rotations of the part's symmetry group, with the identity.
+        symmetries: Rotations of the part's discrete symmetries, with the identity.
 
     Returns:
-        Rotations by increasing angle, :data:`STEP` apart.
+        Rotations by increasing angle, :data:`STEP` apart; the first array has the identity.
     """
     surface = SurfaceTree((np.asarray(mesh.vertices) - centre) / diameter, mesh.faces)
     points, angles = surface.spread(NUM_POINTS, seed=5)[0], np.arange(-math.pi, math.pi, STEP)
@@ -52,22 +51,23 @@ def nearly_round_turns(
         distances = surface.distances(points @ np.swapaxes(turns, 1, 2), neighbours=1)
         return bool(distances.mean(axis=1).max() < NEARLY_ROUND)
 
-    found = []
+    found: list[Turns] = []
     for axis, across in np.eye(3)[[[0, 1], [1, 2], [2, 0]]]:
         about_axis = np.array([axis_rotation(axis, angle) for angle in angles])
         for side in np.eye(3), axis_rotation(across, math.pi):
             turns = about_axis @ side
             if are_nearly_round(turns[::16]) and are_nearly_round(turns):
-                found.append(turns[_smallest(turns, symmetries)])
+                former = np.concatenate([np.empty((0, 3, 3)), *found])
+                found.append(turns[_distinct(turns, former, symmetries)])
     return [turns for turns in found if len(turns) > 1]
 
 
-def _smallest(turns: Turns, symmetries: Turns) -> list[int]:
-    """Return the index of the smallest turn of each group that symmetries make equal."""
-    chosen: list[int] = []
+def _distinct(turns: Turns, former: Turns, symmetries: Turns) -> list[int]:
+    """Return the indices of turns that no symmetry makes equal to a former or smaller turn."""
+    kept: list[int] = []
     for index in np.argsort(rotation_angle(turns), kind="stable"):
-        from_chosen = np.swapaxes(turns[chosen], 1, 2) @ turns[index]
-        angles = rotation_angle(from_chosen[:, None] @ symmetries)
-        if not chosen or angles.min() > STEP / 2:
-            chosen.append(int(index))
-    return sorted(chosen)
+        others = np.concatenate([former, turns[kept]])
+        steps = (np.swapaxes(others, 1, 2) @ turns[index])[:, None] @ symmetries
+        if not len(others) or rotation_angle(steps).min() > STEP / 2:
+            kept.append(int(index))
+    return sorted(kept)

@@ -93,8 +93,8 @@ class Board:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         indices, pixels = getattr(self, f"_detect_{self.kind}")(grey)
         points = self.points[indices]
-        # Points in a row or column determine no homography, and OpenCV would reject all views.
-        if len(points) < MIN_POINTS or not np.ptp(points[:, :2], axis=0).all():
+        # Points in a line determine no homography, and OpenCV would reject all views.
+        if len(points) < MIN_POINTS or np.linalg.matrix_rank(points - points[0]) < 2:
             return None
         return BoardDetection(name, points, np.asarray(pixels, np.float64).reshape(-1, 2))
 

@@ -83,7 +83,9 @@ def compare_motions(T_base_flange: Transforms, B: Transforms, mount: Mount) -> M
     _, unscaled = _fit_shift(turns, target - shifts[..., 0])
     solution, scaled = _fit_shift(np.concatenate([turns, shifts], axis=2), target)
     # A flange that only rotates about its origin does not determine the scale.
-    if unscaled.mean() < max(SAME_FIT * scaled.mean(), SMALLEST_SHIFT):
+    weights = _robust_weights(scaled)
+    errors = [float(np.average(lengths, weights=weights)) for lengths in (unscaled, scaled)]
+    if errors[0] < max(SAME_FIT * errors[1], SMALLEST_SHIFT):
         return MotionAgreement(rotation, float(np.median(unscaled)), 1.0)
     return MotionAgreement(rotation, float(np.median(scaled)), float(solution[3]))
 

@@ -152,6 +152,7 @@ def _read_csv(path: Path) -> list[Record]:
 
 
 def _with_lower_keys(record: Mapping[Any, object]) -> Record:
+    """Convert the names of a record's fields to lower case."""
     return {str(key).strip().lower(): value for key, value in record.items()}
 
 

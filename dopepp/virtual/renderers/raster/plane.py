@@ -30,6 +30,7 @@ from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
 _VISIBLE: Final = np.float32(0.005)  # smallest share of hidden light that changes an 8-bit image
 
 _SKY_DIRECTIONS: Final = 32  # sampled directions of the sky, one bit each
+_SKY_CELLS: Final = 80  # cells along the longer side of the grid
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -182,7 +183,7 @@ def hidden_sky(
     # Beyond twice the objects' height, little sky is hidden.
     margin = 2 * float(everything[:, 2].max())
     low, high = everything[:, :2].min(axis=0) - margin, everything[:, :2].max(axis=0) + margin
-    cell = float((high - low).max()) / 80
+    cell = float((high - low).max()) / _SKY_CELLS
     columns, rows = (math.ceil(side) + 1 for side in (high - low) / cell)
     bits, splats = np.zeros((rows, columns), np.uint32), np.empty((rows, columns), np.uint32)
     grid = np.array([low[0], low[1], cell])
@@ -193,8 +194,8 @@ def hidden_sky(
     slopes = slopes / np.sqrt(1 - radius**2)[:, None]
     for item, points in zip(objects, heights, strict=True):
         splats[:] = 0
-        # Half the side of a splat, so wide that splats leave no gaps.
-        reach = min(max(0.8 * item.surface.spacing / cell, 0.5), 80.0)
+        # Half the side of a splat, so wide that splats leave no gaps; at most the whole grid.
+        reach = min(max(0.8 * item.surface.spacing / cell, 0.5), _SKY_CELLS)
         _splat(points, reach, slopes, grid, splats)
         # Erode by the splats' overhang.
         cells = round(reach - 0.5)
