@@ -114,9 +114,14 @@ def as_rgb(image: Image.Image, content: bytes) -> Image.Image:
         return image.convert("RGB")
     if not _is_deep(image, content):
         raise ValueError(f"values of mode {image.mode}, not of 8 or 16 bits")
-    grey = Image.fromarray((np.asarray(image, np.uint16) >> 8).astype(np.uint8))
+    grey = Image.fromarray(_upper_eight(image))
     grey.info = image.info
     return grey.convert("RGB")
+
+
+def _upper_eight(image: Image.Image) -> UInt8[np.ndarray, "height width"]:
+    """Return the upper eight bits of a 16-bit grey image."""
+    return (np.asarray(image, np.uint16) >> 8).astype(np.uint8)
 
 
 def whole_image(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
@@ -218,7 +223,7 @@ def read_photo(path: Path) -> RGBImage:
     except Exception as error:  # PIL raises many types for damaged files
         raise UserError(f"image {path}: {_reason(error)}", allowed, save) from error
     if is_grey16:
-        pixels = np.repeat((np.asarray(image, np.uint16) >> 8)[..., None], 3, 2).astype(np.uint8)
+        pixels = np.repeat(_upper_eight(image)[..., None], 3, 2)
     else:  # Pillow keeps the upper eight of 16 bits in colours
         pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
     if is_deep and pixels[..., :3].max() < DARKEST:
