@@ -82,8 +82,9 @@ def calibrate_hand_eye(
     robot = np.array(ROBOT_NOISE)
     for _ in range(4):
         X, Y, covariance = refine(M[inliers], B[inliers], B_cov[inliers], X, Y, robot, mount)
-        robot = _robot_noise(_residuals(M, B, X, Y)[inliers], B_cov[inliers])
-        distances = _distances(M, B, B_cov, X, Y, robot, mount)
+        residuals = _residuals(M, B, X, Y)
+        robot = _robot_noise(residuals[inliers], B_cov[inliers])
+        distances = _distances(residuals, _covariances(M, X, Y, B_cov, robot, mount))
         scale = max(1.0, float(np.median(distances[inliers])) / MEDIAN_CHI2)
         inliers = distances <= OUTLIER * scale
         if inliers.sum() < MIN_POSES:
@@ -207,18 +208,7 @@ def _robot_noise(residuals: Residuals, B_cov: Covariances) -> Noise:
     return np.asarray(np.sqrt(np.maximum(variances, (0.2 * np.array(ROBOT_NOISE)) ** 2)))
 
 
-def _distances(
-    M: Transforms,
-    B: Transforms,
-    B_cov: Covariances,
-    X: Transform,
-    Y: Transform,
-    robot: Noise,
-    mount: Mount,
-) -> Float[np.ndarray, "poses"]:
+def _distances(residuals: Residuals, covariances: Covariances) -> Float[np.ndarray, "poses"]:
     """Return each board pose's squared Mahalanobis distance from X⁻¹ M⁻¹ Y, the expected pose."""
-    residuals = _residuals(M, B, X, Y)
-    whole = np.linalg.solve(_covariances(M, X, Y, B_cov, robot, mount), residuals[..., None])[
-        ..., 0
-    ]
-    return np.asarray((residuals * whole).sum(axis=1))
+    weighted = np.linalg.solve(covariances, residuals[..., None])[..., 0]
+    return np.asarray((residuals * weighted).sum(axis=1))
