@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import cv2
@@ -184,20 +184,19 @@ class TemplateDetector:
 
         Half turns that are symmetries of the part are omitted, and poses beyond the largest tilt.
         """
-        turned = [T_cam_obj @ turn for turn in self._half_turns]
-        return [pose for pose in turned if self._tilt(pose) <= math.radians(self._tilt_deg)]
+        return self._within_tilt(T_cam_obj @ turn for turn in self._half_turns)
 
     def turned(self, T_cam_obj: Transform) -> list[list[Transform]]:
         """Return a pose after turns of a nearly round part, a list for each axis and side.
 
         Poses beyond the largest tilt are omitted; other parts have no list.
         """
-        largest = math.radians(self._tilt_deg)
-        turned = [
-            [pose for pose in T_cam_obj @ turns if self._tilt(pose) <= largest]
-            for turns in self._round_turns
-        ]
+        turned = (self._within_tilt(T_cam_obj @ turns) for turns in self._round_turns)
         return [poses for poses in turned if poses]
+
+    def _within_tilt(self, poses: Iterable[Transform]) -> list[Transform]:
+        """Return the poses up to the largest tilt."""
+        return [pose for pose in poses if self._tilt(pose) <= math.radians(self._tilt_deg)]
 
     def _tilt(self, T_cam_obj: Transform) -> float:
         """Return the angle between the part's z axis and the direction to the camera, radians."""
