@@ -32,6 +32,7 @@ from dopepp.inference.refinement.creases import SharpEdges
 from dopepp.inference.refinement.outline import (
     Contour,
     OutlineMesh,
+    PosedMesh,
     find_contour,
     posed,
 )
@@ -150,14 +151,11 @@ class Verifier:
         crop = self._crop_of([poses[0]], image, K, LONGEST_PX)
         if crop is None:
             return np.zeros(len(poses))
-        gradients, spacing = _gradients(crop.colours), max(1.5, 3.0 * crop.extent / SPACING)
-        means = np.zeros(len(poses))
+        gradients, means = _gradients(crop.colours), np.zeros(len(poses))
         for number, pose in enumerate(poses):
             at = posed(self.mesh, pose, crop.K)
             if at is not None:
-                ids = self._edges.drawn(at, crop.size)
-                contour = find_contour(self.mesh, at, (ids >= 0).astype(np.uint8), spacing)
-                lines = np.concatenate([_lines(contour), self._edges.visible(at, ids, spacing)])
+                lines = np.concatenate(self._drawn(at, crop)[1:])
                 responses = np.zeros(len(lines))
                 _respond(*gradients, lines, np.zeros((1, 2)), responses)
                 means[number] = responses.sum() / max(len(lines), 1)
@@ -211,6 +209,21 @@ class Verifier:
             margins[i, j], margins[j, i] = first - second, second - first
         return margins
 
+    def _drawn(
+        self, at: PosedMesh, crop: Crop
+    ) -> tuple[
+        Int[np.ndarray, "height width"],
+        Float[np.ndarray, "points 4"],
+        Float[np.ndarray, "creases 4"],
+    ]:
+        """Return the triangle at each pixel (−1 for none), and points of outline and creases.
+
+        A point has its pixel (x, y) and unit normal (x, y).
+        """
+        ids, spacing = self._edges.drawn(at, crop.size), max(1.5, 3.0 * crop.extent / SPACING)
+        contour = find_contour(self.mesh, at, (ids >= 0).astype(np.uint8), spacing)
+        return ids, _lines(contour), self._edges.visible(at, ids, spacing)
+
     def _crop_of(
         self, poses: Sequence[Transform], image: RGBImage, K: CameraMatrix, longest_px: int
     ) -> Crop | None:
@@ -261,17 +274,13 @@ class Verifier:
         at = None if crop is None else posed(self.mesh, T_cam_obj, crop.K)
         if crop is None or at is None:
             return None
-        ids = self._edges.drawn(at, crop.size)
+        ids, outline, creases = self._drawn(at, crop)
         mask = (ids >= 0).astype(np.uint8)
-        spacing = max(1.5, 3.0 * crop.extent / SPACING)
-        contour = find_contour(self.mesh, at, mask, spacing)
         odds = log_odds(crop.bins, mask, 1.5, RING * crop.extent, 1)
-        if len(contour) < MIN_POINTS or odds is None or mask.sum() < SMALLEST_PX**2:
+        if len(outline) < MIN_POINTS or odds is None or mask.sum() < SMALLEST_PX**2:
             return None
         gradients = _gradients(crop.colours)
-        outline = _lines(contour)
         along, shifted_outline = _responses(gradients, outline, SHIFTED * crop.extent)
-        creases = self._edges.visible(at, ids, spacing)
         crease, shifted_crease = _responses(gradients, creases, SHIFTED * crop.extent)
         ring = cv2.dilate(mask, None, iterations=round(RING * crop.extent)) - mask
         within = mask.astype(bool)
